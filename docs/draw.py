@@ -162,7 +162,7 @@ def draw_probability() -> Figure:
     )
     points = [skills.SuturePoint((0.0, 55.0, -125.0)), skills.SuturePoint((6.0, 55.0, -125.0))]
     plan = skills.stack(policy, points, demo=demo, psm_m=PsmM(APPROACH, BASE_MM, BASE_XYZW, base_from="stated"))
-    trajectory = skills.time_parametrise(plan.pass_paths, psm_m=plan.psm_m)
+    trajectory = skills.time_parametrise(plan.passes, psm_m=plan.psm_m)
 
     def judged(scale: float) -> Any:
         sizes = {size: scale * getattr(CALIBRATED, size) for size in CALLED}

@@ -1,4 +1,4 @@
-"""Matrix products, sines, cosines, their inverses and exponentials, with the same bits on every processor.
+"""Matrix products, sines, cosines, their inverses, exponentials and intervals, with the same bits on every processor.
 
 IEEE 754 fixes the result of +, -, *, / and square roots, and so of everything that is made of them in a fixed order.
 It does not fix those of numpy's and the C library's other functions, nor the order in which BLAS adds: these choose by
@@ -11,7 +11,7 @@ angle: tan(a / 2) = t / (1 + sqrt(1 + t^2)) with t = tan(a).
 """
 
 from collections.abc import Sequence
-from math import factorial, pi
+from math import factorial, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ _COSINE = [(-1) ** k / factorial(2 * k) for k in range(9)]
 _ARC = [(-1) ** k / (2 * k + 1) for k in range(12)]
 _LOG_2 = (float.fromhex("0x1.62e42feep-1"), float.fromhex("0x1.a39ef35793c76p-33"))  # a sum: the first has few bits
 _EXPONENTIAL = [1 / factorial(k) for k in range(14)]
+NORMAL_95 = 1.959964  # 95 % of a normal distribution lie within so many standard deviations of its mean
 
 
 def product(one: Floats, other: Floats) -> Floats:
@@ -105,3 +106,19 @@ def _series(coefficients: Sequence[float], x: Floats) -> Floats:
         total *= x
         total += one
     return total
+
+
+def wilson(count: float, of: float) -> tuple[float, float]:
+    """Return the score interval of a share at 95 % (Wilson, "Probable inference", JASA 1927).
+
+    Args:
+        count: Number of successes; no whole number, where trials count as fewer independent ones.
+        of: Number of trials, at least 1.
+
+    Returns:
+        The lower and the upper bound, within 0 to 1.
+    """
+    share, z2 = count / of, NORMAL_95**2
+    middle = (share + z2 / (2 * of)) / (1 + z2 / of)
+    half = NORMAL_95 * sqrt(share * (1 - share) / of + z2 / (4 * of**2)) / (1 + z2 / of)
+    return max(0.0, middle - half), min(1.0, middle + half)

@@ -41,6 +41,22 @@ def frozen(values: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: s
     return array
 
 
+def freeze(value: object, dtype: Any = np.float64, **shapes: tuple[int | None, ...]) -> None:
+    """Replace arrays of a frozen dataclass by `frozen` ones, in its constructor; a field that is None stays None.
+
+    Args:
+        value: The value that is constructed.
+        dtype: The type of these arrays.
+        shapes: The required shape of each field, by its name.
+
+    Raises:
+        BadInput: As for `frozen`; the message names the field.
+    """
+    for name, shape in shapes.items():
+        if (given := getattr(value, name)) is not None:
+            object.__setattr__(value, name, frozen(given, dtype, shape, name))
+
+
 def _is_frozen(values: ArrayLike, dtype: Any) -> TypeGuard[NDArray[Any]]:
     """Return whether values are an array as `frozen` returns it; a view of another array may change with that."""
     if type(values) is not np.ndarray or values.dtype != dtype:

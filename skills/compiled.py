@@ -1,11 +1,15 @@
 """Compilation of loops with numba: ordinary Python loops as machine code, loaded only from folders that are safe.
 
-    loop --compiled--> the same loop as machine code
+    @compiled
+    def loop(...)   called as machine code; `loop.plain` is the Python function
 
-The loops are in modules named `_kernels`. numba stores machine code in files and loads it without checking who wrote
-them: in NUMBA_CACHE_DIR if that is set, otherwise beside the code, otherwise in the user's cache folder. If none of
-these is writable, every process compiles for itself, which takes a second or two. numba is imported with the first loop
-that is called, because the import takes an eighth of a server's start.
+A loop stands beside its caller. It takes arrays and numbers, allocates nothing and raises nothing; the plain function
+and the compiled one agree to the last bit, and a test checks it.
+
+numba stores machine code in files and loads it without checking who wrote them: in NUMBA_CACHE_DIR if that is set,
+otherwise beside the code, otherwise in the user's cache folder. If none of these is writable, every process compiles
+for itself, which takes a second or two. numba is imported with the first loop that is called, because the import takes
+an eighth of a server's start.
 """
 
 import logging
@@ -23,15 +27,17 @@ PACKAGE = Path(__file__).resolve().parent
 
 log = logging.getLogger(__name__)
 
+LOOPS: list["Loop"] = []  # of all modules that were imported
 _INNER: list[Callable[..., Any]] = []  # not yet registered with numba
-_TELLING = Lock()
+_REGISTERING = Lock()
 
 
 class Loop:
     """A loop that is compiled, or whose machine code is loaded, at its first call."""
 
-    def __init__(self, loop: Callable[..., Any]) -> None:
-        self.loop = loop
+    def __init__(self, plain: Callable[..., Any]) -> None:
+        self.plain = plain
+        LOOPS.append(self)
 
     def __call__(self, *given: Any) -> Any:
         """Call the machine code."""
@@ -44,13 +50,19 @@ class Loop:
         from numba.extending import register_jitable
 
         # Before the loop is compiled, because numba has to know the functions that it calls.
-        with _TELLING:
+        with _REGISTERING:
             while _INNER:
                 register_jitable(_INNER.pop())
         try:
-            return njit(nogil=True, cache=True)(self.loop)
+            return njit(nogil=True, cache=True)(self.plain)
         except RuntimeError:  # raised by numba if no cache folder is writable
-            return njit(nogil=True)(self.loop)
+            return njit(nogil=True)(self.plain)
+
+    @property
+    def cache_folder(self) -> Path | None:
+        """The folder in which the machine code of the loop's module is cached; None if there is none."""
+        folder = self.machine.stats.cache_path
+        return None if folder is None else Path(folder).resolve()
 
 
 def compiled(loop: Callable[..., Any]) -> Loop:
@@ -64,22 +76,24 @@ def compiled(loop: Callable[..., Any]) -> Loop:
 
 
 def inner(loop: Callable[..., Any]) -> Callable[..., Any]:
-    """Register a function that compiled loops call, so that numba compiles it with them."""
+    """Register a function that compiled loops of the same file call, so that numba compiles it with them.
+
+    Of the same file, because numba compiles cached code again only if the file of the loop itself has changed.
+    """
     _INNER.append(loop)
     return loop
 
 
-def kept_in(loop: Loop) -> Path | None:
-    """Return the folder in which the machine code of a loop's module is cached; None if there is none."""
-    folder = loop.machine.stats.cache_path
-    return None if folder is None else Path(folder).resolve()
+def cache_folders() -> set[Path | None]:
+    """Return the folders in which the machine code of all imported loops is cached; None is in it if one has none."""
+    return {loop.cache_folder for loop in LOOPS}
 
 
-def check_kept(folder: Path | None) -> None:
+def check_cache_folder(folder: Path | None) -> None:
     """Refuse a cache folder to which others can write, and one that is not inside NUMBA_CACHE_DIR if that is set.
 
     Args:
-        folder: The folder that numba uses, as `kept_in` returns it.
+        folder: The folder that numba uses, one of `cache_folders`.
 
     Raises:
         BadSettings: The message names the folder and the remedy.
@@ -97,34 +111,33 @@ def check_kept(folder: Path | None) -> None:
         _refuse_shared(folder, inside=True)
 
 
-def check_wanted() -> None:
+def check_cache_setting() -> None:
     """Refuse a NUMBA_CACHE_DIR to which others can write, before any work and without importing numba.
 
     Raises:
-        BadSettings: As for `check_kept`, which checks the folder that numba really uses when the first loop is loaded.
+        BadSettings: As for `check_cache_folder`, which checks the folder that numba really uses when a loop is loaded.
     """
     wanted = os.environ.get("NUMBA_CACHE_DIR")
     if wanted and Path(wanted).is_dir():
         _refuse_shared(Path(wanted).resolve(), inside=False)
 
 
-def make_ready(work: Callable[[], object], folder: Path | None) -> None:
+def make_ready(work: Callable[[], object]) -> None:
     """Call a function once, so that the loops that it uses are compiled or loaded.
 
     If cached files are damaged, as after a power failure, they are deleted and the function is called again.
 
     Args:
         work: The function.
-        folder: The cache folder; None if there is none.
     """
     try:
         work()
     except Exception:
-        kept = [] if folder is None else sorted(folder.glob("_kernels.*.nb[ci]"))
-        if not kept:  # without cached files the failure has another cause
+        cached = [file for folder in cache_folders() if folder is not None for file in folder.glob("*.nb[ci]")]
+        if not cached:  # without cached files the failure has another cause
             raise
-        log.warning("The compiled loops in %s cannot be loaded; they are compiled again.", folder, exc_info=True)
-        for file in kept:
+        log.warning("The compiled loops cannot be loaded; they are compiled again.", exc_info=True)
+        for file in cached:
             file.unlink(missing_ok=True)
         work()
 

@@ -23,8 +23,8 @@ from rich.table import Table
 
 from skills.client import Client, JobFailed, Problem
 from skills.samples import load_samples
-from skills.schemas.given import Policy
-from skills.schemas.plans import Playback
+from skills.schemas.playbacks import Playback
+from skills.schemas.policies import Policy
 from skills.settings import settings
 
 PICTURES = Path("build/demo")

@@ -80,3 +80,13 @@ def _with_lists(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _with_lists(part) for name, part in value.items()}
     return [_with_lists(part) for part in value] if isinstance(value, tuple | list) else value
+
+
+def parse_json(cls: type[T], json: Any) -> T:
+    """Return a value of a schema, or of another dataclass, from its plain JSON.
+
+    Raises:
+        ValueError: It is not the JSON of such a value.
+    """
+    parsed: T = _adapter(cls).validate_python(json)  # type: ignore[arg-type]
+    return parsed

@@ -189,18 +189,9 @@ def forward(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT) -> tuple[Fl
         The tip in the PSM base frame in mm, shape (T, 3), and its rotation [n o a], shape (T, 3, 3).
     """
     q = frozen(joints, np.float64, (None, 6), "joints")
-    tool = instrument_of(instrument)
-    pose = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    for alpha, a, theta, d in (
-        (+pi / 2, 0.0, q[:, 0] + pi / 2, 0.0),
-        (-pi / 2, 0.0, q[:, 1] - pi / 2, 0.0),
-        (+pi / 2, 0.0, 0.0, q[:, 2] - tool.arm.remote_centre_mm),
-        (0.0, 0.0, q[:, 3], tool.shaft_mm),
-        (-pi / 2, 0.0, q[:, 4] - pi / 2, 0.0),
-        (-pi / 2, WRIST_MM, q[:, 5] - pi / 2, 0.0),
-    ):
-        pose = product(pose, _link(alpha, a, theta, d, len(q)))
-    return pose[:, :3, 3].copy(), product(pose[:, :3, :3], _TIP_IN_HINGE)
+    shaft, wrist, rotation = axes_of(q)
+    depth_mm = q[:, INSERTION, None] - instrument_of(instrument).wrist_offset_mm
+    return depth_mm * shaft + WRIST_MM * wrist, rotation
 
 
 def axes_of(joints: Floats) -> tuple[Floats, Floats, Floats]:
@@ -225,19 +216,6 @@ def axes_of(joints: Floats) -> tuple[Floats, Floats, Floats]:
     hinge = _cross(wrist, z5)
     between = -s6 * wrist - c6 * z5
     return shaft, wrist, np.stack([hinge, between, _cross(hinge, between)], axis=-1)
-
-
-def _link(alpha: float, a: float, theta: Floats | float, d: Floats | float, count: int) -> Floats:
-    """Return one row of the modified DH table as a homogeneous transform per sample, shape (T, 4, 4)."""
-    # Exact for the table's multiples of a right angle, where cos(pi / 2) would leave 6e-17.
-    ca, sa = float(np.round(cos(alpha), 12)), float(np.round(sin(alpha), 12))
-    ct, st = cos(theta), sin(theta)
-    link = np.zeros((count, 4, 4))
-    link[:, 0, 0], link[:, 0, 1], link[:, 0, 3] = ct, -st, a
-    link[:, 1, 0], link[:, 1, 1], link[:, 1, 2], link[:, 1, 3] = st * ca, ct * ca, -sa, -sa * d
-    link[:, 2, 0], link[:, 2, 1], link[:, 2, 2], link[:, 2, 3] = st * sa, ct * sa, ca, ca * d
-    link[:, 3, 3] = 1.0
-    return link
 
 
 # ---- inverse ---------------------------------------------------------------------------------------------------

@@ -21,9 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skills.arrays import Floats
-from skills.learning import _kernels
+from skills.compiled import compiled
 
 MOST_COLOURS = 256  # so that an index is one byte
+NONE, ONE = np.uint64(0), np.uint64(1)  # unsigned, because numba makes a float of a uint64 and a Python integer
+SCATTER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 6.4): spreads similar bits over the table
 SLOTS_BITS = 10  # 2^10 slots in the hash table, of which at most a quarter are filled
 
 
@@ -41,10 +43,49 @@ def palette_of(values: Floats) -> Palette | None:
     bits.flags.writeable = False  # always the same numba type: see `skills.compiled`
     found, places = np.empty(MOST_COLOURS, np.uint64), np.empty(bits.size, np.uint8)
     slots = np.full(1 << SLOTS_BITS, -1, np.int16)
-    colours = _kernels.tell_apart_compiled(bits, found, places, slots, np.uint64(64 - SLOTS_BITS))
+    colours = distinct_numbers(bits, found, places, slots, np.uint64(64 - SLOTS_BITS))
     if colours < 0:
         return None
     return Palette(found[:colours].view(np.float64).copy(), places.reshape(values.shape))
+
+
+@compiled
+def distinct_numbers(bits: Any, found: Any, places: Any, slots: Any, shift: Any) -> Any:
+    """Find the distinct numbers of an array, compared bit by bit, and the index of each element among them.
+
+    Args:
+        bits: The bits of the numbers, shape (N,), uint64.
+        found: The distinct numbers in order of first appearance, shape (F,), uint64, filled.
+        places: Index of each number in `found`, shape (N,), uint8, filled.
+        slots: Hash table of indices in `found`, with linear probing: shape (2^k,), int16, more than F and all -1;
+            changed in place.
+        shift: 64 - k, uint64.
+
+    Returns:
+        The number of distinct numbers; -1 if they are more than `found` has room for.
+    """
+    last_slot = np.uint64(len(slots) - 1)
+    count = 0
+    which = np.int64(-1)
+    before = NONE
+    for i in range(len(bits)):
+        number = bits[i]
+        if number != before or which < 0:  # equal numbers are mostly adjacent, so the table is rarely searched
+            before = number
+            slot = (number * SCATTER) >> shift
+            which = np.int64(slots[slot])
+            while which >= 0 and found[which] != number:
+                slot = (slot + ONE) & last_slot
+                which = np.int64(slots[slot])
+            if which < 0:
+                if count == len(found):
+                    return -1
+                which = np.int64(count)
+                slots[slot] = which
+                found[which] = number
+                count += 1
+        places[i] = which
+    return count
 
 
 def painted(palette: Palette) -> Floats:

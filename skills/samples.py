@@ -26,7 +26,8 @@ from skills.errors import BadInput, BadRecording, SkillsError
 from skills.formats.archive import pack
 from skills.formats.jigsaws import Skill, Trial, meta_line, read_jigsaws, trials
 from skills.remedies import did_you_mean
-from skills.schemas.given import Demonstration, Recording
+from skills.schemas.demos import Demonstration
+from skills.schemas.recordings import Recording
 from skills.seeds.recordings import sample_recordings
 
 

@@ -33,7 +33,7 @@ from skills import logs
 from skills.api.app import create_app, prepare_database, prepare_to_serve
 from skills.api.sessions import MESSAGE_BYTES
 from skills.client import Client
-from skills.compiled import check_wanted
+from skills.compiled import check_cache_setting
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
 from skills.jobs.readiness import align_once, warm_up
@@ -265,7 +265,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
         raise BadSettings("--samples is only for a service on this machine.", Remedy(Action.LOAD_SAMPLES))
     refuse_taken(settings.host, settings.port)
     logs.configure(settings.log_level, as_json=settings.log_format == "json")
-    check_wanted()
+    check_cache_setting()
     if settings.containment == "required":
         refuse_uncontained()
     with closing(Database.of(settings)) as database:

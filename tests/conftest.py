@@ -51,9 +51,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def compile_loops() -> None:
     """Compile the loops once, if they are not cached, before every process of the run compiles them."""
-    for loops in PACKAGE.rglob("_kernels.py"):
-        kept = [file.stat().st_mtime for file in loops.parent.glob("__pycache__/_kernels.*.nbi")]
-        if not kept or min(kept) < loops.stat().st_mtime:
+    for module in PACKAGE.rglob("*.py"):
+        if "import compiled" not in module.read_text():
+            continue
+        cached = [file.stat().st_mtime for file in module.parent.glob(f"__pycache__/{module.stem}.*.nbi")]
+        if not cached or min(cached) < module.stat().st_mtime:
             code = (
                 "import skills.jobs.readiness as w, skills.formats.reader_process as c; w.learn_once(); c.get_ready()"
             )

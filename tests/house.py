@@ -65,7 +65,6 @@ NOUNS = {
     "Problem": "schema, and the error of the client that carries it",
     "Coverage": "value, stored under this name, and the schema of its figures",
     "SuturePoint": "value, stored under this name, and the schema of one that was found",
-    "_kernels": "the compiled loops of a room",
 }
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

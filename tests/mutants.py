@@ -325,7 +325,7 @@ def copied(to: Path) -> Path:
 
     def ignored(folder: str, names: list[str]) -> set[str]:
         kept = "__pycache__" not in folder
-        return {name for name in names if name in WIDE[1:] or (not kept and "_kernels." not in name)}
+        return {name for name in names if name in WIDE[1:] or (not kept and not name.endswith((".nbi", ".nbc")))}
 
     shutil.copytree(ROOT, to, ignore=ignored, symlinks=True)
     return to

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from skills import arithmetic, quaternions
+from skills.arithmetic import wilson
 from skills.quaternions import INVERSE
 
 DRAWN = np.random.default_rng(0)
@@ -102,3 +103,10 @@ def test_flat_points_have_a_turn_and_no_reflection():
     flat = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-1.0, -1.0, 0.0]])
     found = quaternions.best_turn(np.einsum("ni,nj->ij", flat * [1.0, -1.0, 1.0], flat))
     assert found.tolist() == pytest.approx([1.0, 0.0, 0.0, 0.0])  # half a turn about x
+
+
+@pytest.mark.parametrize(
+    ("count", "low", "high"), [(0, 0.0, 0.2775), (5, 0.2366, 0.7634), (8, 0.4902, 0.9433), (10, 0.7225, 1.0)]
+)
+def test_the_wilson_interval_is_the_one_in_tables(count, low, high):
+    assert wilson(count, 10) == pytest.approx((low, high), abs=5e-5)

@@ -26,7 +26,8 @@ import skills
 from skills.cli import app
 from skills.client import Client
 from skills.formats import MEDIA_TYPES
-from skills.schemas.requests import PoseIn, StatedIn
+from skills.schemas.pose_styles import PoseIn
+from skills.schemas.recordings import StatedIn
 from skills.seeds.recordings import Sample, sample_recordings
 from skills.settings import PREFIX, Settings, settings
 from tests.arms import ARMS

@@ -13,7 +13,6 @@ from skills.kinematics import (
     SI,
     WRIST_MM,
     angle_between,
-    axes_of,
     forward,
     instrument_of,
     inverse,
@@ -38,6 +37,28 @@ def any_joints(count: int, seed: int = 7) -> np.ndarray:
     joints = np.random.default_rng(seed).uniform(CLASSIC.lower, CLASSIC.upper, (count, 6))
     joints[:, 2] = np.random.default_rng(seed).uniform(CANNULA_MM, CLASSIC.upper[2], count)
     return joints
+
+
+def by_table(joints: np.ndarray, instrument: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poses of joints by the published Denavit-Hartenberg table, one transform after the other."""
+    tool, q = instrument_of(instrument), joints.T
+    pose, half = np.tile(np.eye(4), (len(joints), 1, 1)), np.pi / 2
+    for alpha, a, theta, d in (
+        (half, 0.0, q[0] + half, 0.0),
+        (-half, 0.0, q[1] - half, 0.0),
+        (half, 0.0, 0.0, q[2] - tool.arm.remote_centre_mm),
+        (0.0, 0.0, q[3], tool.shaft_mm),
+        (-half, 0.0, q[4] - half, 0.0),
+        (-half, WRIST_MM, q[5] - half, 0.0),
+    ):
+        link = np.zeros_like(pose)
+        ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
+        rows = ((ct, -st, 0, a), (st * ca, ct * ca, -sa, -sa * d), (st * sa, ct * sa, ca, ca * d), (0, 0, 0, 1))
+        for row, numbers in enumerate(rows):
+            for column, number in enumerate(numbers):
+                link[:, row, column] = number
+        pose = pose @ link
+    return pose[:, :3, 3], pose[:, :3, :3] @ np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
 
 
 def test_zero_joints_put_the_tip_above_the_remote_centre_pointing_down():
@@ -125,12 +146,10 @@ def test_a_tool_on_the_other_arm_is_off_by_the_difference_of_the_shafts(mixed, o
 
 
 @pytest.mark.parametrize("instrument", INSTRUMENTS)
-def test_the_axes_of_shaft_and_wrist_make_the_tip_of_every_instrument(instrument):
-    joints, tool = any_joints(1000), instrument_of(instrument)
-    shaft, wrist, rotation = axes_of(joints)
-    tip, turned = forward(joints, instrument)
-    np.testing.assert_allclose((joints[:, 2:3] - tool.wrist_offset_mm) * shaft + WRIST_MM * wrist, tip, atol=1e-10)
-    np.testing.assert_allclose(rotation, turned, atol=1e-13)
+def test_the_closed_form_is_the_published_table_of_every_instrument(instrument):
+    joints = any_joints(1000)
+    for ours, theirs in zip(forward(joints, instrument), by_table(joints, instrument), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-10)
 
 
 def test_margins_count_from_the_nearer_limit():

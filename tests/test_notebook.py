@@ -26,7 +26,7 @@ def values() -> dict[str, object]:
     reward = skills.sparse_reward(skills.discretize(demo.tip_mm, skills.PAPER_GRID))
     policy = skills.learn_policy(reward, skills.PhaseQLearning())
     plan = skills.stack(policy, [skills.SuturePoint((0.0, 55.0, -125.0))], demo=demo)
-    trajectory = skills.time_parametrise(plan.pass_paths)
+    trajectory = skills.time_parametrise(plan.passes)
     verdict = skills.judge(ideal_playback(trajectory), trajectory)
     return {"Demonstration": demo, "Policy": policy, "Plan": plan, "Verdict": verdict}
 

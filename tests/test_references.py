@@ -18,7 +18,7 @@ import pytest
 from typer.main import get_command
 
 import skills
-from skills.api.routes import demos, operating, pages, plans
+from skills.api.routes import comparison, operating, pages, plans, recordings
 from skills.cli import app
 from tests.api.conformance import conformance
 
@@ -37,7 +37,8 @@ SLASHED = re.compile(r"`([a-z_]+(?:/[a-z_]+)+)((?:\.\w+)*)`")
 COMMAND = re.compile(r"(?:^(?:\$ )?|`)skills ([a-z][^`\n#|]*)", re.MULTILINE)
 UNDESCRIBED = (
     pages.router,
-    demos.page_router,
+    recordings.page_router,
+    comparison.page_router,
     plans.timeline_page_router,
     operating.sign_in_router,
     operating.reference_router,

@@ -4,7 +4,8 @@
 
 A station is a public function that is called from another room, at its first call. Methods, private modules such as
 `_kernels`, the client, the start of the service, its periodic work and the modules that every room uses (`COMMON`) are
-left out.
+left out of the list. The line above it counts everything: the functions of the package that were called, their files,
+and how often a call is in another room than the call before it. `ONCE` are functions of which a request needs one call.
 """
 
 import io
@@ -12,6 +13,7 @@ import re
 import sys
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +21,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import skills
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, MCAP, POLICY, serving
 from tests.library import cases
@@ -36,6 +38,7 @@ COMMON += (
     "library/operation/locks.py",
 )
 COMMON += ("library/operation/history.py", "transparency.py")  # what is written is logged, whoever writes it
+ONCE = ("find_plan", "time_parametrise", "stack", "plan_identity")
 PERIODIC = ("forget_erased", "forget_gone")  # part of no request, and a slow walk has them
 STARTING = ("confined_reader", "stated_errors")  # called once at the start of the service
 
@@ -50,11 +53,20 @@ class Trace:
 
     def __init__(self) -> None:
         self.stations: dict[CodeType, str] = {}
+        self.calls: Counter[CodeType] = Counter()
+        self.here = ""
+        self.changes = 0  # of room, from one call to the next
 
     def __call__(self, frame: FrameType, event: str, _argument: Any) -> None:
         """Record a call; a profile function of `sys.setprofile`."""
         code = frame.f_code
-        if event != "call" or code in self.stations or not code.co_filename.startswith(PACKAGE):
+        if event != "call" or not code.co_filename.startswith(PACKAGE) or code.co_name.startswith("<"):
+            return
+        self.calls[code] += 1
+        here = room(code.co_filename)
+        self.changes += here != self.here
+        self.here = here
+        if code in self.stations:
             return
         file = code.co_filename.removeprefix(f"{PACKAGE}/")
         if (
@@ -84,8 +96,9 @@ def tracing(title: str) -> Iterator[None]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)
-    files = {station.split()[1] for station in trace.stations.values()}
-    print(f"\n{title}: {len(trace.stations)} stations in {len(files)} files")
+    files = {code.co_filename for code in trace.calls}
+    print(f"\n{title}: {len(trace.calls)} functions, {len(files)} files, {trace.changes} changes of room")
+    print(", ".join(f"{name} {sum(n for c, n in trace.calls.items() if c.co_name == name)}" for name in ONCE))
     for number, station in enumerate(trace.stations.values(), start=1):
         print(f"{number:4} {station}")
 
@@ -100,7 +113,7 @@ def main() -> None:
             service.train()
         data = cases.bag()
         with tracing("bytes to demonstration"):
-            read_told(io.BytesIO(data))  # in the service this runs in a process of its own, where no trace reaches
+            parse_recording(io.BytesIO(data))  # in the service in a process of its own, where no trace reaches
             with serving(url) as service:
                 service.client.add_demo(data, media_type=MCAP, **KESTREL)
         with tracing("request to served policy"), serving(url) as service:

@@ -20,7 +20,7 @@ from skills.api.openapi import complete
 from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import catalogue, demos, operating, pages, plans, policies
+from skills.api.routes import comparison, datasets, demos, operating, pages, people, plans, policies, recordings
 from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
@@ -89,8 +89,10 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.access = Access(app.state.database, settings)
     # `include_router` would analyse every route again, at the first request of each application: 90 ms.
     for router in (  # the order of the calls in the OpenAPI document
-        catalogue.router,
+        people.router,
+        recordings.uploads,
         demos.uploads,
+        recordings.router,
         demos.router,
         policies.job_router,
         policies.router,
@@ -101,16 +103,17 @@ def create_app(settings: Settings) -> FastAPI:
         plans.timeline_router,
         policies.retraining_router,
         policies.card_router,
-        demos.dataset_router,
-        demos.atlas_router,
-        demos.score_router,
+        datasets.router,
+        comparison.atlas_router,
+        comparison.score_router,
         operating.router,
         operating.reference_router,
         pages.router,
-        demos.page_router,
+        recordings.page_router,
+        comparison.page_router,
         plans.timeline_page_router,
         operating.sign_in_router,
-        catalogue.key_router,
+        people.key_router,
     ):
         app.router.routes.extend(router.routes)
     answer_refusals(app)

@@ -96,7 +96,7 @@ async def _reader(request: Request, caller: Asking) -> Reader:
 
 async def _teller(request: Request, caller: Asking) -> Teller:
     """Return the reader that also describes a recording, with the caller's name as the key of its queue."""
-    return partial(request.app.state.reader.tell, key=caller.name)
+    return partial(request.app.state.reader.parse, key=caller.name)
 
 
 async def _settings(request: Request) -> Settings:

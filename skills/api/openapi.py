@@ -17,7 +17,8 @@ from fastapi import APIRouter, Response
 
 from skills.api.authentication import is_open
 from skills.schemas import Given
-from skills.schemas.given import Job, Problem
+from skills.schemas.given import Problem
+from skills.schemas.operation import Job
 
 PROBLEM = "application/problem+json"
 TEXT, BINARY = {"type": "string"}, {"type": "string", "format": "binary"}

@@ -46,7 +46,7 @@ from skills.learning.tube import CertifiedPoses, next_pose
 from skills.library.people import consent
 from skills.library.policies import releases
 from skills.library.policies.versions import next_json, policy_of, poses_of
-from skills.schemas.requests import PoseIn
+from skills.schemas.pose_styles import PoseIn
 from skills.settings import Settings
 
 log = logging.getLogger("skills.api")

@@ -26,8 +26,7 @@ from skills.errors import BadInput
 from skills.remedies import did_you_mean
 
 if TYPE_CHECKING:
-    from skills.schemas.comparison import Recognition
-    from skills.schemas.given import Atlas
+    from skills.schemas.comparison import Atlas, Recognition
 
 SHORT = 12  # characters of a digest: enough to distinguish it from the others in a table
 
@@ -146,7 +145,7 @@ def _rounded(distance: float | None) -> str | None:
 
 if TYPE_CHECKING:
     from skills.client import Client
-    from skills.schemas.given import Score
+    from skills.schemas.scores import Score
 
 scoring_commands = typer.Typer()
 
@@ -385,11 +384,11 @@ def _tell_model(about: dict[str, Any]) -> None:
     from skills.library.comparison.calibrations import accepted
     from skills.scoring.calibration import from_numbers
     from skills.scoring.features import TRIAL_KIND_OF
-    from skills.scoring.validation import level_refusals, refusals
+    from skills.scoring.validation import level_refusals, parse_task, refusals
 
     model, used = from_numbers(about["model"]), accepted(about)
     for task, name in enumerate(model.tasks):
-        judged = about["validated"]["tasks"][name]
+        judged = parse_task(about["validated"]["tasks"][name])
         if name not in used:
             out.print(f"{name} is not rated: {' '.join(refusals(judged))}", markup=False, soft_wrap=True)
             continue

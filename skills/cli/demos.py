@@ -39,7 +39,7 @@ from skills.errors import BadInput, SkillsError
 from skills.remedies import Door, did_you_mean
 
 if TYPE_CHECKING:
-    from skills.schemas.given import Demonstration, Proposal
+    from skills.schemas.demos import Demonstration, Proposal
 
     Part = Literal["whole"] | int | None
 from collections.abc import Mapping

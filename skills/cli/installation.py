@@ -298,7 +298,7 @@ def verify(
         keep_signed(database)
         for part in inspect_installation(
             database,
-            reader.tell,
+            reader.parse,
             decode_all=decode_all,
             heads=heads,
             relearn=settings() if relearn else None,

@@ -25,7 +25,7 @@ from skills.cli.shell import (
 from skills.errors import BadInput, BadSettings
 
 if TYPE_CHECKING:
-    from skills.schemas.plans import Reach
+    from skills.schemas.reach import Reach
 from skills.cli.shell import cell
 
 commands = typer.Typer()
@@ -337,7 +337,7 @@ def calibrate(
     from skills.fields import as_json as plain
     from skills.library.plans.arm_errors import read_measured
     from skills.packing import canonical
-    from skills.verification.arm_errors import calibrate_arm
+    from skills.verification.arm_calibration import calibrate_arm
     from skills.verification.arm_slip import measure_slip
 
     try:

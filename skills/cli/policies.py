@@ -34,8 +34,8 @@ from skills.errors import BadInput, BadSignature, Conflict
 
 if TYPE_CHECKING:
     from skills.client import Client
-    from skills.schemas.given import RetrainedStyle, Retraining
     from skills.schemas.policies import Coverage
+    from skills.schemas.training import RetrainedStyle, Retraining
 
 WATCH_S = 0.3
 MANY = 64  # workers for a batch: as many as the settings say, which allow no more

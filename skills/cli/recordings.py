@@ -120,7 +120,7 @@ if TYPE_CHECKING:
     from skills.client import Client, Progress
     from skills.formats.lerobot import Dataset
     from skills.formats.lerobot.cut import Episode
-    from skills.schemas.given import Recording, RecordingPreview
+    from skills.schemas.recordings import Recording, RecordingPreview
 
 commands = typer.Typer()
 recordings = typer.Typer(no_args_is_help=True, help="Raw recordings.")
@@ -453,7 +453,7 @@ def _statements(path: Path) -> dict[str, dict[str, Any]]:
     """
     from pydantic import ValidationError
 
-    from skills.schemas.requests import StatedIn
+    from skills.schemas.recordings import StatedIn
 
     try:
         said = tomllib.loads(path.read_text())

@@ -106,7 +106,7 @@ def _stored(listing: str) -> list[str]:
 
 if TYPE_CHECKING:
     from skills.client import Client, Progress
-    from skills.schemas.given import Job
+    from skills.schemas.operation import Job
     from skills.settings import Settings
     from skills.transparency import PublicKey
 

@@ -50,7 +50,7 @@ from skills.remedies import Door, Remedy, read_remedies
 
 if TYPE_CHECKING:
     from skills.client import Client
-    from skills.schemas.given import Job
+    from skills.schemas.operation import Job
     from skills.schemas.tries import TryStep
     from skills.settings import Settings
 

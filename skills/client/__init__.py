@@ -39,7 +39,8 @@ from skills.client.recordings import Catalogue, Datasets, Recordings
 from skills.client.transport import Awaited, Blocking, Progress, Retrying, Transport
 from skills.errors import BadSettings
 from skills.remedies import Action, Remedy
-from skills.schemas.given import Key, NewKey, Ready, ServedAt, SignedCheckpoint
+from skills.schemas.given import Ready, ServedAt, SignedCheckpoint
+from skills.schemas.people import Key, NewKey
 
 if TYPE_CHECKING:
     from skills.client.sessions import AsyncSession, Session

@@ -40,7 +40,7 @@ from skills.client.transport import (
 )
 from skills.errors import SkillsError
 from skills.remedies import did_you_mean, read_remedies
-from skills.schemas.given import Job
+from skills.schemas.operation import Job
 
 TOO_MANY, UNAVAILABLE = 429, 503
 LONGEST_SHOWN = 60  # longest value that a message repeats, in characters

@@ -9,8 +9,12 @@ from skills.client.policies import Position
 from skills.client.transport import Progress
 from skills.errors import BadInput
 from skills.remedies import did_you_mean
-from skills.schemas.given import Job, SuturePoints
-from skills.schemas.plans import Comparison, MotionTimeline, Plan, PlanSummary, Playback, Reach, Trajectory
+from skills.schemas.operation import Job
+from skills.schemas.plans import Plan, PlanSummary, Trajectory
+from skills.schemas.playbacks import Comparison, Playback
+from skills.schemas.reach import Reach
+from skills.schemas.recordings import SuturePoints
+from skills.schemas.timelines import MotionTimeline
 
 BAG, MCAP = "application/zip", "application/vnd.mcap"
 Source = Literal["recordings", "demos", "policy-versions", "plans"]

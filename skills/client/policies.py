@@ -27,25 +27,14 @@ from skills.client.connection import (
 )
 from skills.client.transport import keep
 from skills.errors import BadInput, Corrupt
-from skills.schemas.given import (
-    Atlas,
-    Job,
-    Nearest,
-    NextPose,
-    NextStep,
-    Policy,
-    PolicyCard,
-    PolicySummary,
-    PoseStyle,
-    Progress,
-    RecognisedRecording,
-    RetrainedStyle,
-    Retraining,
-    Rollout,
-    Score,
-    SignedEnvelope,
-    Version,
-)
+from skills.schemas.cards import PolicyCard
+from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
+from skills.schemas.given import SignedEnvelope
+from skills.schemas.operation import Job
+from skills.schemas.policies import NextStep, Policy, PolicySummary, Rollout, Version
+from skills.schemas.pose_styles import NextPose, PoseStyle
+from skills.schemas.scores import Progress, Score
+from skills.schemas.training import RetrainedStyle, Retraining
 from skills.schemas.tries import TryStep
 
 if TYPE_CHECKING:
@@ -553,13 +542,13 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
 
     from skills.gridworld.domain import Domain
     from skills.gridworld.grid import GridPath, GridWorld
+    from skills.gridworld.hazards import Surroundings
     from skills.gridworld.reward import RewardLevels
-    from skills.gridworld.scene import Surroundings
-    from skills.learning.dynamic_programming import ShortestWay
     from skills.learning.networks import Network
     from skills.learning.policy import Policy as LearntPolicy
     from skills.learning.policy import learner_of
     from skills.learning.q_learning import Training
+    from skills.learning.ties import ShortestWay
 
     grid = GridWorld(**{name: about["grid"][name] for name in ("origin_mm", "cell_mm", "shape")})
     shown = about.get("combined") or demo["report"] | {"hysteresis": demo["hysteresis"]}

@@ -8,19 +8,11 @@ from typing import Any, Literal
 from skills.client.connection import Connection, at, call, given
 from skills.client.transport import Progress
 from skills.schemas import DemoOutcome, Handedness, OutcomeAsked, ProposalDecision, ProposalState, SkillLevel
-from skills.schemas.given import (
-    DatasetEpisodes,
-    Demonstration,
-    DemoPath,
-    Job,
-    Proposal,
-    Recording,
-    RecordingPreview,
-    RecordingSummary,
-    RewardMap,
-    Surgeon,
-    SutureType,
-)
+from skills.schemas.datasets import DatasetEpisodes
+from skills.schemas.demos import Demonstration, DemoPath, Proposal, RewardMap
+from skills.schemas.operation import Job
+from skills.schemas.people import Surgeon, SutureType
+from skills.schemas.recordings import Recording, RecordingPreview, RecordingSummary
 
 
 class Catalogue(Connection):

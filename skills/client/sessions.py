@@ -26,7 +26,7 @@ from websockets.sync.client import reconnect
 from skills.client.connection import Connection, Later, NotUnderstood, Now, SessionClosed, at, call, given, problem_of
 from skills.client.transport import finished
 from skills.errors import BadInput, BadSettings
-from skills.schemas.given import SessionOpening, SessionPose
+from skills.schemas.pose_styles import SessionOpening, SessionPose
 
 CLOSE_S = 1.0  # for the service to take leave
 LOST = 1006  # of RFC 6455: the connection ended without a reason

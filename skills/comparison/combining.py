@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import product
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze, frozen
 from skills.comparison.distances import TREMOR_S, distances, medoid, placed, resampled
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import smoothed_tip
@@ -164,8 +164,7 @@ class Combined:
     moved: bool
 
     def __post_init__(self) -> None:
-        for name, shape in {"tip_mm": (None, 3), "width_mm": (len(self.tip_mm),), "apart_mm": (None,)}.items():
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        freeze(self, tip_mm=(None, 3), width_mm=(len(self.tip_mm),), apart_mm=(None,))
 
 
 def combine(demos: Sequence[Demo], how: Combining) -> Combined:

@@ -28,13 +28,14 @@ multidimensional scaling (Torgerson, 1952): the two directions with the largest 
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import product
-from skills.arrays import Floats, Ints, frozen
-from skills.comparison import _kernels
+from skills.arrays import Floats, Ints, freeze, frozen
+from skills.compiled import compiled, inner
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import smoothed_tip
 from skills.errors import BadInput, BadPath
@@ -160,7 +161,7 @@ def _measured(paths: Floats, references: Floats, pairs: Ints) -> Floats:
 
     def measure(part: slice) -> None:
         row = np.empty(references.shape[1] + 1)
-        _kernels.warp_pairs_compiled(paths, references, chosen[part], row, totals[part])
+        warp_pairs(paths, references, chosen[part], row, totals[part])
 
     ends = np.linspace(0, len(chosen), 1 + min(THREADS, 1 + len(chosen) // WORTH_A_THREAD)).astype(int).tolist()
     parts = [slice(*ends[at : at + 2]) for at in range(len(ends) - 1)]
@@ -170,6 +171,45 @@ def _measured(paths: Floats, references: Floats, pairs: Ints) -> Floats:
     with ThreadPoolExecutor(len(parts)) as threads:
         list(threads.map(measure, parts))
     return totals
+
+
+@inner
+def warped(path: Any, reference: Any, row: Any) -> Any:
+    """Return the sum of the Manhattan distances along the shortest warping of two paths.
+
+    Args:
+        path: Points, shape (T, 3).
+        reference: Points in the same unit, shape (R, 3).
+        row: Workspace, shape (R + 1,), overwritten.
+    """
+    # One row of the table is enough, because only the total is returned, not the alignment.
+    row[:] = float("inf")
+    row[0] = 0.0
+    for i in range(path.shape[0]):
+        before, row[0] = row[0], float("inf")
+        for j in range(reference.shape[0]):
+            apart = 0.0
+            for axis in range(3):
+                apart += abs(path[i, axis] - reference[j, axis])
+            best = min(before, row[j], row[j + 1])
+            before = row[j + 1]
+            row[j + 1] = apart + best
+    return row[reference.shape[0]]
+
+
+@compiled
+def warp_pairs(paths: Any, references: Any, pairs: Any, row: Any, totals: Any) -> None:
+    """Compute the distance between the path and the reference of each pair.
+
+    Args:
+        paths: Points, shape (N, T, 3).
+        references: Points in the same unit, shape (M, R, 3).
+        pairs: Indices of a path and a reference each, shape (K, 2).
+        row: Workspace, shape (R + 1,), overwritten.
+        totals: The result, shape (K,), overwritten.
+    """
+    for k in range(pairs.shape[0]):
+        totals[k] = warped(paths[pairs[k, 0]], references[pairs[k, 1]], row)
 
 
 def medoid(apart: Floats, members: Ints) -> int:
@@ -213,11 +253,8 @@ class Measured:
 
     def __post_init__(self) -> None:
         count = len(self.others)
-        if self.shape_mm is not None:
-            object.__setattr__(self, "shape_mm", frozen(self.shape_mm, np.float64, (STATES, 3), "shape_mm"))
-        object.__setattr__(self, "others", frozen(self.others, np.int64, (count,), "others"))
-        for name in ("apart_mm", "apart_scaled"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (count,), name))
+        freeze(self, shape_mm=(STATES, 3), apart_mm=(count,), apart_scaled=(count,))
+        freeze(self, np.int64, others=(count,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,14 +280,7 @@ class Difference:
     along: Floats
 
     def __post_init__(self) -> None:
-        for name, shape in {
-            "offsets": (3, 3),
-            "nets": (3, 3),
-            "sizes": (3, 3),
-            "shares": (3, 3),
-            "along": (None, 3),
-        }.items():
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        freeze(self, offsets=(3, 3), nets=(3, 3), sizes=(3, 3), shares=(3, 3), along=(None, 3))
 
     @property
     def where(self) -> tuple[str, str]:
@@ -321,9 +351,8 @@ class Dendrogram:
 
     def __post_init__(self) -> None:
         size = len(self.order)
-        object.__setattr__(self, "joined", frozen(self.joined, np.int64, (size - 1, 2), "joined"))
-        object.__setattr__(self, "heights", frozen(self.heights, np.float64, (size - 1,), "heights"))
-        object.__setattr__(self, "order", frozen(self.order, np.int64, (size,), "order"))
+        freeze(self, heights=(size - 1,))
+        freeze(self, np.int64, joined=(size - 1, 2), order=(size,))
 
     def cut(self, clusters: int) -> Ints:
         """Return the cluster of each demonstration, shape (N,), counted from 0 in the order of the dendrogram.

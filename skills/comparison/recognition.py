@@ -43,17 +43,17 @@ The last two depend on the set-up: on where arm and tissue stand. The last ident
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import exp, log, sqrt
+from math import exp, log
 
 import numpy as np
 
-from skills.arrays import Flags, Floats, Ints, frozen
+from skills.arithmetic import wilson
+from skills.arrays import Flags, Floats, Ints, freeze
 from skills.comparison.distances import STATES, TREMOR_S, placed, resampled
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
 from skills.errors import BadInput, BadPath
 from skills.kinematics import matrix_of, quaternion_of
-from skills.learning.slip import wilson
 from skills.quaternions import vector_of
 
 PHASES = 16  # of a curve
@@ -169,10 +169,9 @@ def _coefficients(curve: Floats, count: int) -> Floats:
     return np.asarray(_COSINES[:count] @ curve).ravel()
 
 
-STEPS = 40  # of golden section: the temperature is then known to 1e-7
+EXACT = 1e-7  # of the temperature, relative
 FOLDS, INNER_FOLDS = 20, 5  # groups of sessions left out; with fewer sessions, each is left out alone
 WIDEST = 1e3  # the temperature is searched between the median distance divided by this and multiplied by this
-GOLDEN = (sqrt(5.0) - 1.0) / 2.0
 SHRINKAGES = (0.1, 0.3, 0.6)  # 0 keeps the covariance of the training data, 1 ignores it
 SETS = (
     ("shape",),
@@ -297,8 +296,7 @@ class Validated:
     log_loss: float
 
     def __post_init__(self) -> None:
-        shape = (len(self.tested), len(self.surgeons))
-        object.__setattr__(self, "probability", frozen(self.probability, np.float64, shape, "probability"))
+        freeze(self, probability=(len(self.tested), len(self.surgeons)))
 
     @property
     def accuracy(self) -> float:
@@ -581,8 +579,8 @@ def probabilities(away: Floats, temperature: float | None) -> Floats:
 def calibrate(away: Floats, truth: Ints) -> tuple[float, float]:
     """Return the temperature that makes the true surgeons likeliest, and their log loss.
 
-    The loss is a convex function of the reciprocal of the temperature. Golden section finds its minimum on the
-    logarithm, so that a small temperature is as exact as a large one.
+    The loss is a convex function of the reciprocal of the temperature. Its minimum is found on the logarithm, so that a
+    small temperature is as exact as a large one.
 
     Args:
         away: Distances from each surgeon, shape (M, S).
@@ -600,17 +598,8 @@ def calibrate(away: Floats, truth: Ints) -> tuple[float, float]:
     def loss(reciprocal: float) -> float:
         return float((of_truth * reciprocal + np.log(np.exp(-further * reciprocal).sum(axis=1))).mean())
 
-    low, high = -log(typical * WIDEST), log(WIDEST / typical)
-    one, two = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-    at_one, at_two = loss(exp(one)), loss(exp(two))
-    for _ in range(STEPS):
-        if at_one <= at_two:
-            high, two, at_two = two, one, at_one
-            one = high - GOLDEN * (high - low)
-            at_one = loss(exp(one))
-        else:
-            low, one, at_one = one, two, at_two
-            two = low + GOLDEN * (high - low)
-            at_two = loss(exp(two))
-    reciprocal = exp((low + high) / 2.0)
-    return 1.0 / reciprocal, loss(reciprocal)
+    from scipy.optimize import minimize_scalar  # here, because it is slow to import
+
+    bounds = -log(typical * WIDEST), log(WIDEST / typical)
+    found = minimize_scalar(lambda at: loss(exp(at)), bounds=bounds, method="bounded", options={"xatol": EXACT})
+    return exp(-found.x), float(found.fun)

@@ -32,17 +32,19 @@ from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 from skills.comparison.distances import Measured
 from skills.db import Base, Number, RowId, Sha256, Slug, now
 from skills.db.packed import Packed, stored
-from skills.demonstration.demonstration import Demo, Partner, Pause
-from skills.demonstration.partner import PartnerMotion
+from skills.demonstration.demonstration import Demo
+from skills.demonstration.movement import Pause
+from skills.demonstration.partner import Partner, PartnerMotion
 from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.hazards import SceneCosts, Surroundings
 from skills.gridworld.reward import RewardLevels, RewardMap
-from skills.gridworld.scene import Box, Capsule, Scene, SceneCosts, Surroundings, Tissue
+from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.learning.certificate import Coverage
-from skills.learning.dynamic_programming import ShortestWay
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import Training
+from skills.learning.ties import ShortestWay
 from skills.learning.tube import CertifiedPoses
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 from skills.packing import few_numbers

@@ -18,10 +18,10 @@ from skills.errors import LearnerNotInstalled, LearningFailed, Unanswered
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.learning import policy as table
-from skills.learning.dynamic_programming import REMOTE_CENTRE, ShortestWay
 from skills.learning.networks import DDPG, DQN, TRPO, Deep, Network, network_q
 from skills.learning.policy import Learner, Policy, check_learnable
 from skills.learning.q_learning import Training
+from skills.learning.ties import REMOTE_CENTRE, ShortestWay
 from skills.packing import known
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone

@@ -16,39 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze
 from skills.demonstration.movement import Pause, clutched, is_driven, undriven
 from skills.demonstration.partner import Partner, PartnerMotion, in_base, partner_along, partner_at
 from skills.demonstration.recording import (
     BaseFrame,
-    Format,
-    Integrity,
     Motion,
     Recording,
-    Signal,
-    Topic,
     base_frames,
-    recorded_motion,
 )
-from skills.demonstration.segments import Segment, propose_segments
 from skills.errors import BadSegment, JointsDisagree, NotMetres
 from skills.notebook import card
-
-__all__ = [
-    "Demo",
-    "Format",
-    "Integrity",
-    "Motion",
-    "Partner",
-    "Pause",
-    "Recording",
-    "Segment",
-    "Signal",
-    "Topic",
-    "cut_demo",
-    "propose_segments",
-    "recorded_motion",
-]
 
 CLASSIC_LARGE_NEEDLE_DRIVER = "400006"  # the dVRK's tool number, if the recording neither shows nor states one
 EXTENT_LIMITS_MM = (1.0, 300.0)  # less: metres declared as millimetres; more: beyond a PSM's reach
@@ -97,15 +75,7 @@ class Demo:
         count = len(self.stamps_s)
         if count < 2:
             raise BadSegment(f"A demonstration needs at least 2 samples, this one has {count}.", samples=count)
-        shapes: dict[str, tuple[int, ...]] = {
-            "stamps_s": (count,),
-            "tip_mm": (count, 3),
-            "rotation_xyzw": (count, 4),
-            "jaw_rad": (count,),
-        }
-        for name, shape in shapes.items():
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        freeze(self, stamps_s=(count,), tip_mm=(count, 3), rotation_xyzw=(count, 4), jaw_rad=(count,))
         if self.stamps_s[0] != 0 or (np.diff(self.stamps_s) <= 0).any():
             raise BadSegment("The stamps of a demonstration start at 0 and increase strictly.")
         _check_extent(self.topic, self.tip_mm)

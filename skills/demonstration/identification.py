@@ -6,15 +6,9 @@ A recording rarely says which arm generation it is of, with which instrument, an
 poses. Joints and poses together do: forward kinematics q -> f(q) of the right arm and instrument is the recorded pose,
 up to one rigid transform from the base to the frame of the poses, and that of a wrong one is not.
 
-*Hypotheses.* The tip is (q3 - offset) s + wrist x5 (`kinematics.axes_of`), so an arm with an instrument is two lengths:
-
-    offset   remote centre less shaft: 15.6 mm for an instrument on an arm of its own generation, 66.4 mm for a Classic
-             instrument on a Si, -35.2 mm for a S/Si instrument on a Classic
-    wrist    from its pitch axis to the hinge of the jaws: 9.1 to 11.2 mm
-
-Instruments with equal lengths are one hypothesis, because no pose can tell them apart: a Classic with 400006 and a Si
-with 420006 have the same kinematics. What the file states then decides between them, else the range of the joints, else
-the large needle driver of the Classic is named, with all others in `candidates`.
+*Hypotheses.* Arms with instruments that can be told apart by their poses (`skills.demonstration.hypotheses`). Among
+those with equal lengths what the file states decides, else the range of the joints, else the large needle driver of the
+Classic is named, with all others in `candidates`.
 
 *Fit.* For each hypothesis the transform is fitted to positions and orientations together (Kabsch), an orientation with
 the weight of a lever of `LEVER_MM`. Where the recording states that its poses are in the arm's base, no transform is
@@ -27,9 +21,7 @@ the joints are known, the delay of the joints that fits best is found, and all h
 (`MARGIN`, `PIECES`, `FLOOR_MM`) is not told apart: if their lengths differ by more than `SAME_MM`, the motion was too
 small, and nothing is identified. If nothing fits as a whole, but each piece by itself, the frame of the poses moved.
 
-Sources: jhu-dvrk/sawIntuitiveResearchKit @9e535e68, share/tool/*.json (numbers, lengths of shaft and wrist) and
-share/kinematic/PSM.json and PSM_Si.json. The snake-like instruments and the stapler there have other wrists, which are
-not computed. Hypotheses, thresholds and decision are ours.
+Thresholds and decision are ours.
 """
 
 from collections.abc import Iterator
@@ -43,18 +35,19 @@ from numpy.typing import ArrayLike
 
 from skills.arithmetic import arccos, arcsin, product
 from skills.arrays import Floats, frozen, xyz
-from skills.fields import Count, Point, Quaternion, schema
-from skills.kinematics import (
-    CLASSIC,
-    INSERTION,
-    JAW_TIP_MM,
-    SI,
-    ArmConstants,
-    axes_of,
-    check_rotation,
-    matrix_of,
-    quaternion_of,
+from skills.demonstration.hypotheses import (
+    ARMS,
+    HYPOTHESES,
+    KNOWN,
+    OTHER_WRISTS,
+    Generation,
+    Hypothesis,
+    generation_of,
+    matching,
+    stated_instrument,
 )
+from skills.fields import Count, Point, Quaternion, schema
+from skills.kinematics import INSERTION, JAW_TIP_MM, axes_of, check_rotation, matrix_of, quaternion_of
 from skills.quaternions import best_turn
 
 FIT_MM = 1.0  # a recorder that writes the last joints it has at 30 Hz is off by 0.5 mm at 50 mm/s
@@ -75,55 +68,7 @@ STILL_SHARE = 0.05  # of a piece's own extent: a piece that hardly moves fits ev
 BEYOND_RAD, BEYOND_MM = 0.05, 5.0  # a measured joint may be this far beyond the limits with which its arm is driven
 _WILD = 1e6  # rad or mm: no joint's value; the sine of it would be meaningless
 
-Generation = Literal["Classic", "Si"]
 Verdict = Literal["identified", "undetermined", "wrong instrument", "wrong frame", "moved frame", "contradiction"]
-
-_ARMS: dict[Generation, ArmConstants] = {"Classic": CLASSIC, "Si": SI}
-_SHAFT_MM: dict[Generation, float] = {"Classic": 416.2, "Si": 467.0}
-_PREFIX: dict[Generation, str] = {"Classic": "400", "Si": "420"}
-# The last three digits of the instruments of each generation, by the length of the wrist in mm; the most usual first.
-_NUMBERS: dict[Generation, dict[float, str]] = {
-    "Classic": {
-        9.1: "006 296 036 001 003 007 033 035 048 049 178 179 181",
-        9.3: "183 184",
-        10.0: "309",
-        10.7: "093 127 172 189 205 207 208 230",
-        11.2: "194",
-    },
-    "Si": {
-        9.1: "006 296 036 001 007 033 048 049 178 179 181",
-        9.3: "183 184",
-        10.0: "309",
-        10.7: "093 172 205 230 327",
-        11.2: "194",
-    },
-}
-_OTHER_WRISTS = ("400117", "420117", "400143", "410298")  # two snake-like needle drivers, a dissector, a stapler
-
-
-@dataclass(frozen=True)
-class _Hypothesis:
-    """The lengths of an arm with an instrument, and the names of all that have them."""
-
-    offset_mm: float
-    wrist_mm: float
-    names: tuple[str, ...]
-
-
-def _hypotheses() -> tuple[_Hypothesis, ...]:
-    found: dict[tuple[float, float], list[str]] = {}
-    for made_for, by_wrist in _NUMBERS.items():
-        for wrist_mm, numbers in by_wrist.items():
-            for generation, arm in _ARMS.items():
-                offset_mm = round(arm.remote_centre_mm - _SHAFT_MM[made_for], 6)
-                on = "" if generation == made_for else f"-{generation}"
-                names = [f"{_PREFIX[made_for]}{number}{on}" for number in numbers.split()]
-                found.setdefault((offset_mm, wrist_mm), []).extend(names)
-    return tuple(_Hypothesis(offset, wrist, tuple(names)) for (offset, wrist), names in found.items())
-
-
-HYPOTHESES = _hypotheses()
-_KNOWN = frozenset(name for one in HYPOTHESES for name in one.names)
 
 
 @schema
@@ -156,18 +101,18 @@ class Identification:
     """
 
     verdict: Verdict
-    instrument: str | None
-    generation: Generation | None
-    candidates: tuple[str, ...]
+    instrument: str | None = None
+    generation: Generation | None = None
+    candidates: tuple[str, ...] = ()
     stated: str | None
     in_base: bool
-    position_mm: Point
-    rotation_xyzw: Quaternion
+    position_mm: Point = (0.0, 0.0, 0.0)
+    rotation_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
     residual_mm: float
     greatest_mm: float
-    residual_rad: float | None
-    delay_s: float
-    next_mm: float | None
+    residual_rad: float | None = None
+    delay_s: float = 0.0
+    next_mm: float | None = None
     samples: Count
     reason: str
 
@@ -194,21 +139,6 @@ class ArmIdentification:
     def is_of(self, arm: str, topic: str) -> bool:
         """Return whether it is of the poses of an arm on a topic."""
         return (self.arm, self.topic) == (arm, topic)
-
-
-def stated_instrument(name: str) -> str | None:
-    """Return the number in the name of a tool, as the console or a user gives it.
-
-    Args:
-        name: Such as "LARGE_NEEDLE_DRIVER:420006[..11]", "420006" or "420006-Classic".
-
-    Returns:
-        The number, with the arm's generation if it is named; None if there is no number.
-    """
-    said = name.rpartition(":")[2].partition("[")[0]
-    number, _, on = said.partition("-")
-    is_number = len(number) == 6 and number.isascii() and number.isdigit()
-    return said if is_number and (said == number or on in _ARMS) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +174,7 @@ class _Poses:
         shaft, wrist, turned = axes_of(joints)
         return replace(self, joints=joints, shaft=shaft, wrist=wrist, turned=turned)
 
-    def tips_of(self, one: _Hypothesis) -> Floats:
+    def tips_of(self, one: Hypothesis) -> Floats:
         """Return the positions in the base that a hypothesis predicts, mm, shape (T, 3)."""
         depth = self.joints[:, INSERTION : INSERTION + 1] - one.offset_mm
         tip: Floats = depth * self.shaft + one.wrist_mm * self.wrist
@@ -252,25 +182,15 @@ class _Poses:
 
     def part(self, samples: slice) -> "_Poses":
         """Return some of the samples."""
-        return _Poses(
-            joints=self.joints[samples],
-            shaft=self.shaft[samples],
-            wrist=self.wrist[samples],
-            turned=self.turned[samples],
-            tip_mm=self.tip_mm[samples],
-            rotation=None if self.rotation is None else self.rotation[samples],
-            in_base=self.in_base,
-            speeds=None if self.speeds is None else self.speeds[samples],
-            delay_s=self.delay_s,
-            beyond_mm=self.beyond_mm,
-        )
+        rotation, speeds = (None if one is None else one[samples] for one in (self.rotation, self.speeds))
+        return replace(self.moved(self.joints[samples]), tip_mm=self.tip_mm[samples], rotation=rotation, speeds=speeds)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """A hypothesis with the best transform: position and rotation of the base in the frame of the poses."""
 
-    of: _Hypothesis
+    of: Hypothesis
     position_mm: Floats
     rotation: Floats
     away_mm: Floats  # distance of each sample, shape (T,)
@@ -326,7 +246,16 @@ def identify(
         check_rotation(turned)
     number = None if stated is None else stated_instrument(stated)
     if not (np.abs(q) <= _WILD).all() or not (speed is None or (np.abs(speed) <= _WILD).all()):
-        return _unexplained(len(q), number, in_base, "a joint's value or speed is beyond a million rad or mm")
+        reason = "a joint's value or speed is beyond a million rad or mm"
+        return Identification(
+            verdict="contradiction",
+            stated=number,
+            in_base=in_base,
+            residual_mm=_WILD,
+            greatest_mm=_WILD,
+            samples=len(q),
+            reason=reason,
+        )
     poses = _Poses(q, *axes_of(q), tip, turned, in_base, speed)
     few = poses.part(slice(None, None, -(-len(q) // TRIED_SAMPLES)))
     fits = sorted(_fits(few), key=_misfit)
@@ -346,7 +275,7 @@ def _fits(poses: _Poses) -> Iterator[_Fit]:
         yield _fit(poses, one)
 
 
-def _without_delay(poses: _Poses, one: _Hypothesis) -> _Poses:
+def _without_delay(poses: _Poses, one: Hypothesis) -> _Poses:
     """Take the delay that fits a hypothesis best out of the joints; nothing changes if none up to `LATEST_S` does."""
     assert poses.speeds is not None
     now, step_s = poses, 1e-3
@@ -371,7 +300,7 @@ def _misfit(fit: _Fit) -> float:
     return misfit if isfinite(misfit) else np.inf
 
 
-def _fit(poses: _Poses, one: _Hypothesis) -> _Fit:
+def _fit(poses: _Poses, one: Hypothesis) -> _Fit:
     """Fit the transform from the base to the frame of the poses; none if that frame is stated to be the base."""
     tip = poses.tips_of(one)
     if poses.in_base:
@@ -405,9 +334,11 @@ def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) ->
     if poses.in_base and (moved := _beside_the_base(poses, best)) is not None:
         return moved
     stood = [name for fit in near for name in fit.of.names if _reaches(poses.joints, name)]
-    found = _told(poses, best, "identified", stood, stated, min((fit.residual_mm for fit in others), default=None))
-    names = _in_words(found)
-    if stated in _OTHER_WRISTS or (stated in _KNOWN and not _matching(stood, stated)):
+    found = _identified(
+        poses, best, "identified", stood, stated, min((fit.residual_mm for fit in others), default=None)
+    )
+    names = _describe_candidates(found)
+    if stated in OTHER_WRISTS or (stated in KNOWN and not matching(stood, stated)):
         reason = f"the recording states {stated}, but its joints and poses fit {names}"
         return replace(found, verdict="wrong instrument", reason=reason)
     lengths = np.array([(fit.of.offset_mm, fit.of.wrist_mm) for fit in near])
@@ -428,24 +359,12 @@ def _is_told_apart(other: _Fit, best: _Fit) -> bool:
     return other.residual_mm >= MARGIN * best.residual_mm or all(piece.mean() > 0.0 for piece in pieces)
 
 
-def _matching(names: list[str], stated: str) -> list[str]:
-    """Return the names that a stated instrument may have: of a bare number also those on the other generation."""
-    return [name for name in names if stated in (name, name.partition("-")[0])]
-
-
 def _reaches(joints: Floats, name: str) -> bool:
     """Return whether the arm of an instrument can have these joints."""
-    number, _, generation = name.partition("-")
-    arm = _ARMS[_generation(number, generation)]
+    arm = ARMS[generation_of(name)]
     beyond = np.array([BEYOND_RAD, BEYOND_RAD, BEYOND_MM])
     low, high = np.array(arm.lower[:3]) - beyond, np.array(arm.upper[:3]) + beyond
     return bool(((joints[:, :3] >= low) & (joints[:, :3] <= high)).all())
-
-
-def _generation(number: str, on: str) -> Generation:
-    if on:
-        return "Classic" if on == "Classic" else "Si"
-    return "Classic" if number.startswith(_PREFIX["Classic"]) else "Si"
 
 
 def _beside_the_base(poses: _Poses, best: _Fit) -> Identification | None:
@@ -464,21 +383,21 @@ def _wrong_frame(poses: _Poses, free: _Fit) -> Identification:
         f"the poses are stated to be relative to the arm's base, but the joints put the base at ({x:.1f}, {y:.1f}, "
         f"{z:.1f}) mm in their frame, turned by {turn:.1f} degrees"
     )
-    found = _told(replace(poses, in_base=False), free, "wrong frame", [], None, None)
+    found = _identified(replace(poses, in_base=False), free, "wrong frame", [], None, None)
     return replace(found, reason=reason, instrument=None, generation=None)
 
 
-def _told(
+def _identified(
     poses: _Poses, fit: _Fit, verdict: Verdict, names: list[str], stated: str | None, next_mm: float | None
 ) -> Identification:
-    preferred = _matching(names, stated) if stated is not None else []
+    preferred = matching(names, stated) if stated is not None else []
     candidates = tuple(dict.fromkeys(preferred + names))
     first = candidates[0] if candidates else None
     x, y, z, w = quaternion_of(fit.rotation[None])[0].tolist()
     return Identification(
         verdict=verdict,
         instrument=first,
-        generation=None if first is None else _generation(*first.partition("-")[::2]),
+        generation=None if first is None else generation_of(first),
         candidates=candidates,
         stated=stated,
         in_base=poses.in_base or _is_identity(fit),
@@ -500,7 +419,7 @@ def _is_identity(fit: _Fit) -> bool:
     return bool(away <= max(MARGIN * fit.residual_mm, 0.1))
 
 
-def _in_words(found: Identification) -> str:
+def _describe_candidates(found: Identification) -> str:
     shown = ", ".join(found.candidates[:4])
     more = len(found.candidates) - 4
     return f"{shown} and {more} more" if more > 0 else shown or "no arm whose joints reach so far"
@@ -517,7 +436,7 @@ def _not_explained(poses: _Poses, best: _Fit, stated: str | None) -> Identificat
             return replace(_wrong_frame(poses, free), stated=stated)
     elif _fits_in_pieces(poses):
         reason = "each part of the recording fits by itself, but not all together: the frame of the poses moved"
-        found = _told(poses, best, "moved frame", [], stated, None)
+        found = _identified(poses, best, "moved frame", [], stated, None)
         return replace(found, reason=reason)
     turn = "" if poses.rotation is None else f" and {np.degrees(best.residual_rad):.1f} degrees"
     reason = (
@@ -525,7 +444,7 @@ def _not_explained(poses: _Poses, best: _Fit, stated: str | None) -> Identificat
         f"{best.residual_mm:.2f} mm{turn} (root mean square)"
     )
     hint = next((words for words, tried in _explanations(poses) if min(map(_misfit, _fits(tried))) < _BETTER), None)
-    found = _told(poses, best, "contradiction", [], stated, None)
+    found = _identified(poses, best, "contradiction", [], stated, None)
     return replace(found, reason=reason if hint is None else f"{reason}; they would agree {hint}")
 
 
@@ -580,23 +499,3 @@ def _explanations(poses: _Poses) -> Iterator[tuple[str, _Poses]]:
     if poses.rotation is not None:
         yield "if the orientations were inverted", replace(poses, rotation=poses.rotation.swapaxes(1, 2))
         yield "without the orientations", replace(poses, rotation=None)
-
-
-def _unexplained(samples: int, stated: str | None, in_base: bool, reason: str) -> Identification:
-    return Identification(
-        verdict="contradiction",
-        instrument=None,
-        generation=None,
-        candidates=(),
-        stated=stated,
-        in_base=in_base,
-        position_mm=(0.0, 0.0, 0.0),
-        rotation_xyzw=(0.0, 0.0, 0.0, 1.0),
-        residual_mm=_WILD,
-        greatest_mm=_WILD,
-        residual_rad=None,
-        delay_s=0.0,
-        next_mm=None,
-        samples=samples,
-        reason=reason,
-    )

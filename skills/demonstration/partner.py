@@ -28,7 +28,7 @@ from math import exp
 
 import numpy as np
 
-from skills.arrays import Flags, Floats, frozen, xyz
+from skills.arrays import Flags, Floats, freeze, xyz
 from skills.demonstration.movement import Span, same_signs, spans_of
 from skills.demonstration.recording import BaseFrame, Motion, Recording, Signal
 from skills.fields import Point, Quaternion, computed_field, schema
@@ -89,10 +89,7 @@ class PartnerMotion:
 
     def __post_init__(self) -> None:
         count = len(self.tip_mm)
-        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (count, 3), "tip_mm"))
-        object.__setattr__(self, "rotation_xyzw", frozen(self.rotation_xyzw, np.float64, (count, 4), "rotation_xyzw"))
-        if self.jaw_rad is not None:
-            object.__setattr__(self, "jaw_rad", frozen(self.jaw_rad, np.float64, (count,), "jaw_rad"))
+        freeze(self, tip_mm=(count, 3), rotation_xyzw=(count, 4), jaw_rad=(count,))
 
 
 def partner_at(

@@ -14,7 +14,7 @@ Motions, joints and signals are checked in their constructors (`skills.demonstra
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from typing import Literal
@@ -23,22 +23,15 @@ import numpy as np
 
 from skills.arithmetic import product
 from skills.arrays import Floats, Ints
-from skills.demonstration.identification import (
-    MOST_SAMPLES,
-    ArmIdentification,
-    Identification,
-    identify,
-    stated_instrument,
-)
-from skills.demonstration.motion import (
-    Joints,
-    Motion,
-    Signal,
-    equal_samples,
-    recorded_joints,
-    recorded_motion,
-    recorded_signal,
-)
+from skills.demonstration.hypotheses import stated_instrument
+from skills.demonstration.identification import MOST_SAMPLES, ArmIdentification, Identification, identify
+from skills.demonstration.motion import Joints as Joints
+from skills.demonstration.motion import Motion as Motion
+from skills.demonstration.motion import Signal as Signal
+from skills.demonstration.motion import equal_samples as equal_samples
+from skills.demonstration.motion import recorded_joints as recorded_joints
+from skills.demonstration.motion import recorded_motion as recorded_motion
+from skills.demonstration.motion import recorded_signal as recorded_signal
 from skills.errors import NoUsableTopic, UnreadableRecording
 from skills.fields import Count, Point, Quaternion, schema
 from skills.kinematics import matrix_of, quaternion_of
@@ -252,23 +245,6 @@ def _pairs(stamps_ns: Ints, others_ns: Ints) -> tuple[Ints, Ints]:
     return near, nearer[near]
 
 
-__all__ = [
-    "BaseFrame",
-    "Column",
-    "Format",
-    "Integrity",
-    "Joints",
-    "Label",
-    "Motion",
-    "Recording",
-    "Signal",
-    "Topic",
-    "base_frames",
-    "equal_samples",
-    "recorded_joints",
-    "recorded_motion",
-    "recorded_signal",
-]
 ARMS_LIMIT, MOTIONS_LIMIT = 16, 200  # ours: a da Vinci has three PSMs; every pair of arms and of motions is compared
 
 Format = Literal["mcap", "csv", "jigsaws", "rosbag2", "rosbag1", "lerobot"]
@@ -440,15 +416,6 @@ class Recording:
         """
         place = motion.arm, motion.frame, motion.states_base
         return next((one for one in self.setpoints if (one.arm, one.frame, one.states_base) == place), None)
-
-    def without_setpoints(self, faults: Mapping[str, str]) -> "Recording":
-        """Return it without the setpoints on some topics, and with the fault of each in `left_out`."""
-        return replace(
-            self,
-            setpoints=tuple(one for one in self.setpoints if one.topic not in faults),
-            jaw_setpoints=tuple((arm, one) for arm, one in self.jaw_setpoints if one.topic not in faults),
-            left_out=tuple((dict(self.left_out) | dict(faults)).items()),
-        )
 
     def jaw_setpoint_of(self, arm: str) -> Signal | None:
         """Return the setpoints of an arm's jaw, or None if they were not recorded."""

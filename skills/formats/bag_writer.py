@@ -32,26 +32,15 @@ import numpy as np
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
-from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Joints, Motion, Recording, Signal
+from skills.arrays import Ints
+from skills.demonstration.recording import Motion, Recording, Signal
 from skills.errors import BadRecording
 from skills.formats import topics
 from skills.formats.archive import pack
+from skills.formats.columns import in_metres
 from skills.formats.mcap.reader import NOTES
 from skills.formats.topics import BOOL, FLOAT64, JOINT_STATE, JOY, POSE, STRING
-from skills.kinematics import INSERTION
 from skills.verification.timeline import ArmTrack, Timeline
-
-__all__ = [
-    "DEFINITIONS",
-    "Written",
-    "bag_folder",
-    "messages_of",
-    "metadata_of",
-    "write_bag",
-    "write_mcap",
-    "write_messages",
-]
 
 _NANO = 1_000_000_000
 _RULE = "=" * 80
@@ -219,7 +208,6 @@ class _Body:
 
 _LIBRARY = "suture-skills"
 _QOS = "offered_qos_profiles"
-_INSERTION = 2  # the PSM's only prismatic joint
 
 
 @dataclass
@@ -253,13 +241,19 @@ def write_mcap(recording: Recording) -> bytes:
     return file.getvalue()
 
 
-def write_messages(said: Iterable[Message], file: IO[bytes], notes: Mapping[str, str] | None = None) -> Written:
+def write_messages(
+    said: Iterable[Message],
+    file: IO[bytes],
+    notes: Mapping[str, str] | None = None,
+    definitions: Mapping[str, str] = DEFINITIONS,
+) -> Written:
     """Write messages as an MCAP file.
 
     Args:
         said: The messages, in the order of writing.
         file: The file.
         notes: Stored in a metadata record of the file.
+        definitions: The ros2msg definition of each message type.
     """
     writer, written = Writer(file), Written()
     writer.start(profile="ros2", library=_LIBRARY)
@@ -270,7 +264,7 @@ def write_messages(said: Iterable[Message], file: IO[bytes], notes: Mapping[str,
     for message in said:
         key = (message.topic, message.type)
         if message.type not in schemas:
-            definition = DEFINITIONS[message.type].encode()
+            definition = definitions[message.type].encode()
             schemas[message.type] = writer.register_schema(message.type, "ros2msg", definition)
         if key not in channels:
             channels[key] = writer.register_channel(message.topic, "cdr", schemas[message.type], {_QOS: "[]"})
@@ -312,7 +306,8 @@ def _messages(recording: Recording) -> Iterator[Message]:
         yield from _poses(motion, "measured_cp")
     for joints in recording.joints:
         topic = _named(joints.topic, f"/{joints.arm}/measured_js")
-        for stamp_ns, row in zip(joints.stamps_ns.tolist(), _metric(joints).tolist(), strict=True):
+        positions = in_metres(joints.positions) if joints.arm.upper().startswith("PSM") else joints.positions
+        for stamp_ns, row in zip(joints.stamps_ns.tolist(), positions.tolist(), strict=True):
             yield joint_state(topic, stamp_ns, row)
     for motion in recording.setpoints:
         yield from _poses(motion, "setpoint_cp")
@@ -344,14 +339,6 @@ def _poses(motion: Motion, topic: str) -> Iterator[Message]:
     places = (motion.tip_mm / 1000.0).tolist()  # ROS messages are in metres
     for stamp_ns, place_m, turn in zip(motion.stamps_ns.tolist(), places, motion.rotation_xyzw.tolist(), strict=True):
         yield pose(topic, stamp_ns, motion.frame, place_m, turn)
-
-
-def _metric(joints: Joints) -> Floats:
-    """Return joint positions in a message's units: the insertion in metres."""
-    positions = joints.positions.copy()
-    if joints.arm.upper().startswith("PSM"):
-        positions[:, _INSERTION : _INSERTION + 1] /= 1000.0
-    return positions
 
 
 def _pedals(recording: Recording) -> Iterator[tuple[str, Signal]]:
@@ -451,9 +438,7 @@ def _of_arm(arm: ArmTrack, rows: Ints, stamps_ns: list[int]) -> Iterator[Message
         if row[0] == row[0]:  # not NaN: the arm was recorded
             yield pose(f"{topic}/pose", stamp_ns, arm.frame, row[:3], row[3:])
     if arm.joints is not None:
-        metric = arm.joints[rows].astype(float)
-        metric[:, INSERTION] /= 1000.0
-        for stamp_ns, row in zip(stamps_ns, metric.tolist(), strict=True):
+        for stamp_ns, row in zip(stamps_ns, in_metres(arm.joints[rows]).tolist(), strict=True):
             if row[0] == row[0]:
                 yield joint_state(f"{topic}/joints", stamp_ns, row)
     for name, column in (("jaw", arm.jaw_rad), ("speed", arm.speed_mm_s)):

@@ -11,13 +11,14 @@ arm lags behind. No fault of a setpoint refuses a recording, because nothing is 
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skills.arithmetic import cos, sin
 from skills.arrays import Floats, Ints
 from skills.demonstration.motion import COORDINATE_LIMIT_MM
 from skills.demonstration.recording import Motion, Signal, recorded_motion, recorded_signal
 from skills.errors import MixedFrames, NotAQuaternion, NotMetres, NoUsableTopic, SkillsError
-from skills.kinematics import INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
+from skills.kinematics import INSERTION, INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
 from skills.quaternions import of_vector
 from skills.remedies import Action, Remedy
 
@@ -35,6 +36,21 @@ def scaled(values: Floats, factor: float) -> Floats:
     """Return values in mm or rad; infinite ones, where they overflow, are refused by the recording's values."""
     with np.errstate(over="ignore"):
         return values if factor == 1 else factor * values
+
+
+def in_mm(joints: Floats) -> Floats:
+    """Return joints, shape (T, K), with the insertion in mm, from metres; infinite ones are refused as above."""
+    converted = joints.astype(np.float64)
+    with np.errstate(over="ignore"):
+        converted[:, INSERTION] *= 1000.0
+    return converted
+
+
+def in_metres(joints: NDArray[np.floating]) -> Floats:
+    """Return joints, shape (T, K), with the insertion in metres, from mm."""
+    converted = joints.astype(np.float64)
+    converted[:, INSERTION] /= 1000.0
+    return converted
 
 
 def base_of(arm: str, frame: str | None) -> str:

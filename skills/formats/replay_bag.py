@@ -19,16 +19,19 @@ import hashlib
 import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+from pydantic import BaseModel
 
 from skills.arrays import Floats, Ints
 from skills.errors import BadPlan
 from skills.formats import bag_writer
 from skills.formats.archive import pack
 from skills.formats.bag_writer import Message, bag_folder
-from skills.kinematics import INSERTION, JOINTS, forward, instrument_of, quaternion_of
+from skills.formats.checksums import SUMS, write_sums
+from skills.formats.columns import in_metres
+from skills.kinematics import JOINTS, forward, instrument_of, quaternion_of
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory
@@ -36,7 +39,6 @@ from skills.planning.trajectory import Trajectory
 CRTK_ARMS = ("PSM1", "PSM2", "PSM3")  # the names that `dvrk_bag_replay.py -a` accepts
 EPOCH_NS = 1_000_000_000  # ours: a stamp of 0 is "invalid" to CRTK, and a plan has no date
 PAUSE_TICKS = 1.5  # stamps further apart than this many sample periods are a pause between passes
-SUMS = "SHA256SUMS"
 
 Role = Literal["PSM_A", "PSM_M"]
 
@@ -144,7 +146,7 @@ def arms_of(
         frame=frame,
         rate_hz=trajectory.rate_hz,
         stamps_ns=stamps_ns,
-        joints=_metric(trajectory.joints[rows]),
+        joints=in_metres(trajectory.joints[rows]),
         tip_m=trajectory.tip_mm[rows] / 1000.0,
         rotation_xyzw=trajectory.rotation_xyzw[rows],
         jaw_rad=np.full(len(rows), jaw_rad) if trajectory.jaw_rad is None else trajectory.jaw_rad[rows],
@@ -161,7 +163,7 @@ def arms_of(
         frame=f"{names[1]}_base",
         rate_hz=trajectory.rate_hz,
         stamps_ns=stamps_ns,
-        joints=_metric(psm_m.joints[rows]),
+        joints=in_metres(psm_m.joints[rows]),
         tip_m=tip_mm / 1000.0,
         rotation_xyzw=quaternion_of(rotation),
         jaw_rad=np.full(len(rows), JAW_OPEN_RAD) if psm_m.jaw_rad is None else psm_m.jaw_rad[rows],
@@ -231,73 +233,102 @@ def notes_of(motion: ArmMotion, plan_sha256: str) -> dict[str, str]:
     }
 
 
-def timetable(trajectory: Trajectory, arms: tuple[ArmMotion, ...]) -> list[dict[str, Any]]:
-    """Return the passes of a bag on the one clock of its setpoints, for a program or a person that executes it.
+class PhaseTimes(BaseModel):
+    """A phase of a pass: its first and its last stamp."""
 
-    For each pass: its index, the first and the last stamp of each of its phases, `hand_over` and `take_back`. The first
-    of these is where PSM_M takes the needle, at the end of A2; the second where PSM_A has it again, at the end of a
-    transfer, before whose `at_ns` the surgeon inserts the needle and takes it (M1, M2). Both have the stamp at which
-    the arms stand and the jaws begin to move, and each jaw in the order in which they move, with the stamps between
-    which it does. None where the jaws do not move.
+    phase: str
+    from_ns: int
+    to_ns: int
+
+
+class JawMove(BaseModel):
+    """The motion of one arm's jaw: its last angle, and the stamps between which it moves."""
+
+    arm: str
+    jaw_rad: float
+    from_ns: int
+    to_ns: int
+
+
+class HandOver(BaseModel):
+    """The needle's change from one arm to the other: the stamp at which the arms stand, and the jaws in their order."""
+
+    at_ns: int
+    jaws_in_order: list[JawMove]
+
+
+class PassTimes(BaseModel):
+    """A pass on the clock of the setpoints.
+
+    PSM_M takes the needle in `hand_over`, at the end of A2. PSM_A has it again after `take_back`, at the end of a
+    transfer; before its `at_ns` the surgeon inserts the needle and takes it (M1, M2). None where the jaws do not move.
+    """
+
+    index: int
+    phases: list[PhaseTimes]
+    hand_over: HandOver | None
+    take_back: HandOver | None = None
+
+
+class Timetable(BaseModel):
+    """The passes of a bag on the one clock of its setpoints, for a program or a person that executes it.
+
+    Attributes:
+        plan: The SHA-256 of the plan.
+        use: The limits of its use.
+        before_each_pass: Instructions to the person.
+        passes: The passes.
+    """
+
+    plan: str
+    use: str = ""
+    before_each_pass: str = ""
+    passes: list[PassTimes]
+
+
+def pass_times(trajectory: Trajectory, arms: tuple[ArmMotion, ...]) -> list[PassTimes]:
+    """Return the times of each pass of a bag.
 
     Args:
         trajectory: The one that the bag is made of.
-        arms: What `arms_of` made of it.
+        arms: The result of `arms_of` for it.
     """
     rows = rows_of_pass(trajectory, arms[0].pass_index)
     stamps_ns, number, phase = arms[0].stamps_ns, trajectory.pass_index[rows], trajectory.phase[rows]
     found = []
     for one in np.unique(number).tolist():
-        parts = [(name, stamps_ns[(number == one) & (phase == k)]) for k, name in enumerate(PHASES)]
+        parts = [(name, stamps_ns[(number == one) & (phase == k)].tolist()) for k, name in enumerate(PHASES)]
+        transfer = np.flatnonzero((number == one) & (phase == TRANSFER))
         found.append(
-            {
-                "pass": one,
-                "phases": [
-                    {"phase": name, "from_ns": int(part[0]), "to_ns": int(part[-1])}
-                    for name, part in parts
-                    if len(part)
-                ],
-                "hand_over": _changes_hands(arms, np.flatnonzero((number == one) & (phase == A2))),
-                "take_back": _changes_hands(arms, _and_next(np.flatnonzero((number == one) & (phase == TRANSFER)))),
-            }
+            PassTimes(
+                index=one,
+                phases=[PhaseTimes(phase=name, from_ns=ns[0], to_ns=ns[-1]) for name, ns in parts if ns],
+                hand_over=_hand_over(arms, np.flatnonzero((number == one) & (phase == A2))),
+                # with the sample after them, where the jaws' motion ends
+                take_back=_hand_over(arms, np.append(transfer, transfer[-1:] + 1)),
+            )
         )
     return found
 
 
-def _and_next(rows: Ints) -> Ints:
-    """Return samples and the one after them, where what moves in them ends."""
-    return np.append(rows, rows[-1:] + 1)
-
-
-def _changes_hands(arms: tuple[ArmMotion, ...], rows: Ints) -> dict[str, Any] | None:
-    """Return when each jaw moves in some samples of a bag, the first first; None unless both do."""
+def _hand_over(arms: tuple[ArmMotion, ...], rows: Ints) -> HandOver | None:
+    """Return when each jaw moves in some samples of a bag; None unless both do."""
     moves = []
     for arm in arms:
         steps = np.flatnonzero(np.diff(arm.jaw_rad[rows]) != 0)
         if len(steps):
             first, last = rows[steps[0]], rows[steps[-1] + 1]
-            moves.append((int(arm.stamps_ns[first]), int(arm.stamps_ns[last]), arm.name, float(arm.jaw_rad[last])))
+            from_ns, to_ns = arm.stamps_ns[[first, last]].tolist()
+            moves.append(JawMove(arm=arm.name, jaw_rad=float(arm.jaw_rad[last]), from_ns=from_ns, to_ns=to_ns))
     if len(moves) < 2:
         return None
-    moves.sort()
-    return {
-        "at_ns": moves[0][0],
-        "jaws_in_order": [
-            {"arm": name, "jaw_rad": to, "from_ns": begins, "to_ns": ends} for begins, ends, name, to in moves
-        ],
-    }
+    moves.sort(key=lambda move: (move.from_ns, move.to_ns, move.arm))
+    return HandOver(at_ns=moves[0].from_ns, jaws_in_order=moves)
 
 
 def seal(members: Mapping[str, bytes]) -> bytes:
-    """Return a zip archive of files by name, with their checksums in the format of `sha256sum -c`."""
-    sums = "".join(f"{hashlib.sha256(members[name]).hexdigest()}  {name}\n" for name in sorted(members))
+    """Return a zip archive of files by name, with their checksums."""
+    sums = write_sums({name: hashlib.sha256(data).hexdigest() for name, data in members.items()})
     out = io.BytesIO()
-    pack({name: io.BytesIO(data) for name, data in sorted({**members, SUMS: sums.encode()}.items())}, out)
+    pack({name: io.BytesIO(data) for name, data in sorted({**members, SUMS: sums}.items())}, out)
     return out.getvalue()
-
-
-def _metric(joints: Floats) -> Floats:
-    """Return joints in a message's units: the insertion in metres."""
-    metric = joints.copy()
-    metric[:, INSERTION] /= 1000.0
-    return metric

@@ -31,7 +31,7 @@ from rosbags.typesys import Stores, get_typestore
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Format, Integrity, Recording, Topic
 from skills.errors import BackwardStamps, NoUsableTopic, UnreadableRecording
-from skills.formats import bag_writer, topics
+from skills.formats import topics
 from skills.formats.archive import refusing
 from skills.formats.bag_writer import Message, write_messages
 from skills.formats.mcap import read_mcap
@@ -144,6 +144,7 @@ Suffix = Literal[".bag", ".db3", ".mcap"]
 _FORMATS: dict[Suffix, Format] = {".bag": "rosbag1", ".db3": "rosbag2", ".mcap": "mcap"}
 _NAMES = {".bag": "ROS 1 bag", ".db3": "SQLite bag (.db3)", ".mcap": "MCAP file"}
 _NANO = 1_000_000_000
+_ROS2 = get_typestore(Stores.ROS2_JAZZY)
 
 guard_connections()
 
@@ -169,12 +170,10 @@ def read_rosbag(files: Sequence[BinaryIO], suffix: Suffix, integrity: Integrity 
             paths = [_copied(file, Path(folder) / f"part{number}{suffix}") for number, file in enumerate(files)]
             reader = open_files.enter_context(_reading(paths))  # open files stay readable without their folder
         out = open_files.enter_context(tempfile.TemporaryFile())  # unnamed: deleted when closed
-        faults: dict[str, str] = {}
         with _refusing(paths[0]):
-            here = _convert(reader, out, faults=faults)
+            here = _convert(reader, out)
         out.seek(0)
-        recording = replace(read_mcap(out), format=_FORMATS[suffix], integrity=integrity, topics=here)
-        return recording.without_setpoints(faults) if faults else recording
+        return replace(read_mcap(out), format=_FORMATS[suffix], integrity=integrity, topics=here)
 
 
 def convert(paths: Sequence[Path], out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
@@ -252,7 +251,7 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
 def _reading(paths: Sequence[Path]) -> Iterator[AnyReader]:
     with ExitStack() as stack:
         with _refusing(paths[0]):
-            reader = stack.enter_context(AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_JAZZY)))
+            reader = stack.enter_context(AnyReader(paths, default_typestore=_ROS2))
         yield reader
 
 
@@ -261,14 +260,15 @@ def _refusing(path: Path) -> AbstractContextManager[None]:
     return refusing(f"The {_NAMES.get(path.suffix, 'bag')}", advice)
 
 
-def _convert(
-    reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None, faults: dict[str, str] | None = None
-) -> tuple[Topic, ...]:
+def _convert(reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
     here = _topics(reader)
     if not any(topics.arm_of_pose(topic.name, topic.type) for topic in here):
         said = ", ".join(f"{topic.name} ({topic.type})" for topic in here[:20])
         raise NoUsableTopic(f"No topic has the pose of a PSM. It has {said or 'no topics'}.")
-    write_messages(_messages(reader, faults), out, notes)
+    used = [one for one in reader.connections if topics.meaning(one.topic, one.msgtype) is not None]
+    types = reader.typestore if reader.is2 else _ROS2
+    definitions = {kind: types.generate_msgdef(kind, ros_version=2)[0] for kind in {one.msgtype for one in used}}
+    write_messages(_messages(reader, used), out, notes, definitions)
     return here
 
 
@@ -279,58 +279,19 @@ def _topics(reader: AnyReader) -> tuple[Topic, ...]:
     return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
 
-def _messages(reader: AnyReader, faults: dict[str, str] | None) -> Iterator[Message]:
-    """Yield the used messages; with `faults`, topics of setpoints end at their first fault, which is put there."""
-    wanted = [one for one in reader.connections if topics.meaning(one.topic, one.msgtype) is not None]
-    setpoints = {one.topic for one in wanted if topics.is_setpoint(one.topic, one.msgtype)}
-    for connection, log_ns, data in reader.messages(connections=wanted):
-        topic, write = connection.topic, _WRITERS[connection.msgtype]
-        if faults is None or topic not in setpoints:
-            yield write(topic, log_ns, reader.deserialize(data, connection.msgtype))
-        elif topic not in faults:
-            try:
-                message = write(topic, log_ns, reader.deserialize(data, connection.msgtype))
-            except Exception:  # on a damaged message rosbags may raise anything
-                faults[topic] = "A message of the topic is damaged."
-            else:
-                yield message
+def _messages(reader: AnyReader, used: Sequence[Any]) -> Iterator[Message]:
+    """Yield the messages of some connections as CDR."""
+    for connection, log_ns, data in reader.messages(connections=used):
+        kind = connection.msgtype
+        yield Message(log_ns, connection.topic, kind, data if reader.is2 else _cdr(data, kind))
 
 
-def _pose(topic: str, log_ns: int, said: Any) -> Message:
-    place, turn = said.pose.position, said.pose.orientation
-    return _tip(topic, log_ns, said.header, place, turn)
-
-
-def _transform(topic: str, log_ns: int, said: Any) -> Message:
-    """Write a TransformStamped, with which older dVRKs publish the tip, as a pose."""
-    return _tip(topic, log_ns, said.header, said.transform.translation, said.transform.rotation)
-
-
-def _tip(topic: str, log_ns: int, header: Any, place: Any, turn: Any) -> Message:
-    place_m, turn_xyzw = (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w)
-    return bag_writer.pose(topic, _stamp_ns(header), header.frame_id, place_m, turn_xyzw, log_ns=log_ns)
-
-
-def _joint_state(topic: str, log_ns: int, said: Any) -> Message:
-    stamp_ns, frame = _stamp_ns(said.header), said.header.frame_id
-    return bag_writer.joint_state(topic, stamp_ns, said.position.tolist(), said.name, frame=frame, log_ns=log_ns)
-
-
-def _joy(topic: str, log_ns: int, said: Any) -> Message:
-    return bag_writer.joy(
-        topic, _stamp_ns(said.header), said.buttons.tolist(), frame=said.header.frame_id, log_ns=log_ns
-    )
-
-
-_WRITERS: dict[str, Callable[[str, int, Any], Message]] = {
-    topics.POSE: _pose,
-    topics.TRANSFORM: _transform,
-    topics.JOINT_STATE: _joint_state,
-    topics.JOY: _joy,
-    topics.BOOL: lambda topic, log_ns, said: bag_writer.boolean(topic, log_ns, said.data),
-    topics.FLOAT64: lambda topic, log_ns, said: bag_writer.number(topic, log_ns, said.data),
-    topics.STRING: lambda topic, log_ns, said: bag_writer.text(topic, log_ns, said.data),
-}
+def _cdr(data: bytes, kind: str) -> bytes:
+    """Convert a message of ROS 1; a damaged one becomes empty, so that `read_mcap` refuses or omits its topic."""
+    try:
+        return bytes(_ROS2.ros1_to_cdr(data, kind))
+    except Exception:  # on a damaged message rosbags may raise anything
+        return b"\0\1\0\0"
 
 
 _PLACES: dict[str, Callable[[Any], Any]] = {

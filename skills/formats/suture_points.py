@@ -12,27 +12,26 @@ where PSM_A holds it at the hand-off.
 """
 
 import re
-from collections.abc import Iterator
 from typing import BinaryIO, Literal
 
 import numpy as np
 
 from skills.arrays import Floats, xyz
-from skills.demonstration.recording import Motion, Recording, recorded_motion
-from skills.errors import MixedFrames, NotMetres, NoUsableTopic, SkillsError, UnreadableRecording
-from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, fields_of
-from skills.formats.mcap.reader import Channel, Walker
-from skills.formats.mcap.records import RECOVER
-from skills.formats.reader_process import answered
-from skills.formats.topics import POSE
+from skills.demonstration.recording import Motion, Recording
+from skills.errors import MixedFrames, NotMetres, NoUsableTopic, UnreadableRecording
+from skills.formats.mcap import read_mcap
+from skills.formats.reader_process import write_answer
+from skills.formats.topics import POSE, Meaning, TopicKind
 from skills.kinematics import angle_between, matrix_of, quaternion_of
 from skills.remedies import did_you_mean
 from skills.schemas.recordings import SuturePoint
 from skills.schemas.recordings import SuturePoints as SuturePoints
 
-PARSE = f"{__name__}:parse"
+READ = f"{__name__}:read"
 STEADY_MM, STEADY_RAD = 1.0, 0.05  # ours: a fifth of the paper's cell; a mark that moves more has no single place
 REACH_MM = 300.0  # ours: beyond a PSM's reach from its remote centre; AMBF's units taken for metres are ten times off
+
+NO_MARKS = "The file has no poses of Entry or Exit marks, such as /CRTK/Exit1/measured_cp."
 
 Kind = Literal["entry", "exit"]
 
@@ -56,7 +55,7 @@ def suture_points(scene: Recording, *, arm: str | None = None, frame: str | None
     """
     marks = sorted((m for m in scene.motions if _MARK.fullmatch(m.arm)), key=lambda m: _order(m.arm))
     if not marks:
-        raise NoUsableTopic("The file has no poses of Entry or Exit marks, such as /CRTK/Exit1/measured_cp.")
+        raise NoUsableTopic(NO_MARKS)
     base = _base_of(scene, arm, frame, marks[0].frame)
     first: dict[Kind, Floats] = {}
     points = []
@@ -76,8 +75,8 @@ def suture_points(scene: Recording, *, arm: str | None = None, frame: str | None
         kind: Kind = "entry" if mark.arm.lower().startswith("entry") else "exit"
         turn = rotation @ first.setdefault(kind, rotation).T
         points.append(SuturePoint(mark.arm, kind, kind == "exit", xyz(tip), _xyzw(rotation), _xyzw(turn)))
-    whose = arm if base is None or arm is not None else base.arm
-    return SuturePoints(arm=whose, frame=frame or f"{whose}_base", points=tuple(points))
+    own_arm = arm if base is None or arm is not None else base.arm
+    return SuturePoints(arm=own_arm, frame=frame or f"{own_arm}_base", points=tuple(points))
 
 
 def read_scene(file: BinaryIO) -> Recording:
@@ -92,82 +91,33 @@ def read_scene(file: BinaryIO) -> Recording:
         MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
     """
     try:
-        walker = Walker(file)
-        motions = tuple(_motions(walker))
-    except (SkillsError, MemoryError):
-        raise
-    except Exception as error:  # on a damaged file a parser may raise anything
-        raise UnreadableRecording(f"The MCAP file is truncated or corrupt ({error}). {RECOVER}") from error
-    if not motions:
-        raise NoUsableTopic("The file has no poses of Entry or Exit marks, such as /CRTK/Exit1/measured_cp.")
-    return Recording(format="mcap", integrity=walker.integrity, motions=motions)
+        return read_mcap(file, _meaning)
+    except NoUsableTopic as error:
+        raise NoUsableTopic(NO_MARKS) from error
 
 
-def parse(file: BinaryIO, answer: BinaryIO) -> None:
+def read(file: BinaryIO, answer: BinaryIO) -> None:
     """Read a scene, and write it or its refusal; runs in a fork under limits."""
-    answered(read_scene, file, answer)
+    write_answer(read_scene, file, answer)
 
 
 # ---- from the file ----------------------------------------------------------------------------------------------
 
 
-def _whose(topic: str) -> str | None:
-    """Return the mark or the arm whose pose a topic carries; None for any other topic."""
+def _meaning(topic: str, message_type: str) -> Meaning | None:
+    """Return the mark or the arm whose pose a topic carries; None for any other topic.
+
+    Raises:
+        UnreadableRecording: It is one, of another type than a pose.
+    """
     *_, name, what = ["", *topic.split("/")]
     is_mark = what == "measured_cp" and _MARK.fullmatch(name)
     is_base = what == _BASE and name.lower().startswith("psm")
-    return name if is_mark or is_base else None
-
-
-def _motions(walker: Walker) -> Iterator[Motion]:
-    decoders: dict[int, Decoder] = {}
-    found: dict[str, list[tuple[np.ndarray, Columns]]] = {}
-    for stretch in walker.stretches():
-        channel = stretch.channel
-        if _whose(channel.topic) is None:
-            continue
-        if channel.number not in decoders:
-            decoders[channel.number] = _decoder(walker, channel)
-        columns = decoders[channel.number].decode(stretch.data, stretch.begin, stretch.length)
-        found.setdefault(channel.topic, []).append((stretch.log_ns, columns))
-    for topic, parts in sorted(found.items()):
-        yield _motion(topic, parts)
-
-
-def _decoder(walker: Walker, channel: Channel) -> Decoder:
-    schema = walker.schemas.get(channel.schema)
-    encodings = (channel.encoding, None if schema is None else schema.encoding)
-    if (
-        schema is None
-        or schema.name.replace("/msg/", "/") != POSE.replace("/msg/", "/")
-        or encodings != ("cdr", "ros2msg")
-    ):
-        raise UnreadableRecording(
-            f"{channel.topic} is not a {POSE} as written by ROS 2; record it as one, or convert the bag.",
-            topic=channel.topic,
-        )
-    return Decoder(channel.topic, fields_of(schema.name, schema.definition.decode()), WANTED_POSE)
-
-
-def _motion(topic: str, parts: list[tuple[np.ndarray, Columns]]) -> Motion:
-    frames = sorted({label for _, columns in parts for label in columns.labels})
-    if len(frames) > 1:
-        raise MixedFrames(
-            f"{topic} has poses in {len(frames)} frames; record each frame on a separate topic.", frames=frames[:20]
-        )
-    order = np.argsort(np.concatenate([log_ns for log_ns, _ in parts]), kind="stable")
-    values = np.concatenate([columns.values for _, columns in parts])[order]
-    stamps_ns = np.concatenate([columns.stamps_ns for _, columns in parts if columns.stamps_ns is not None])[order]
-    with np.errstate(over="ignore"):  # infinite values are refused below
-        tip_mm = 1000.0 * values[:, :3]  # the simulator publishes metres
-    return recorded_motion(
-        arm=_whose(topic) or "",
-        topic=topic,
-        frame=frames[0],
-        stamps_ns=stamps_ns,
-        tip_mm=tip_mm,
-        rotation_xyzw=values[:, 3:],
-    )
+    if not (is_mark or is_base):
+        return None
+    if message_type != POSE:
+        raise UnreadableRecording(f"{topic} is not a {POSE}; record it as one, or convert the bag.", topic=topic)
+    return Meaning(TopicKind.MOTION, name)
 
 
 # ---- one place --------------------------------------------------------------------------------------------------

@@ -54,11 +54,11 @@ class TopicKind(Enum):
 class Meaning:
     """The quantity that a topic carries, and its source.
 
-    `whose` is an arm such as "PSM2", a teleoperation such as "MTMR_PSM1", or the topic of a pedal.
+    `owner` is an arm such as "PSM2", a teleoperation such as "MTMR_PSM1", or the topic of a pedal.
     """
 
     kind: TopicKind
-    whose: str
+    owner: str
 
 
 def meaning(topic: str, message_type: str) -> Meaning | None:
@@ -87,7 +87,7 @@ def arm_of_pose(topic: str, message_type: str) -> str | None:
     carries it.
     """
     said = meaning(topic, message_type)
-    return said.whose if said is not None and said.kind is TopicKind.MOTION else None
+    return said.owner if said is not None and said.kind is TopicKind.MOTION else None
 
 
 def is_setpoint(topic: str, message_type: str) -> bool:
@@ -120,8 +120,8 @@ def _is_pedal(topic: str) -> bool:
     return group == "footpedals" or (group == "console" and name in _CONSOLE)
 
 
-def _about(kind: TopicKind, whose: str | None) -> Meaning | None:
-    return None if whose is None else Meaning(kind, whose)
+def _about(kind: TopicKind, owner: str | None) -> Meaning | None:
+    return None if owner is None else Meaning(kind, owner)
 
 
 def _named(pattern: re.Pattern[str], topic: str) -> str | None:

@@ -12,26 +12,38 @@ and surroundings are those of the plan is not verified: `docs/replay.md`. The ch
 who computes them again; the signature of the service does, for whoever has its public key (`--key`).
 """
 
-import hashlib
-import json
-import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, Field, StrictBool, StrictStr, ValidationError
 
-from skills.arrays import Floats, Ints
+from skills.arrays import Flags, Floats, Ints
 from skills.errors import BadBag, Corrupt, UnknownInstrument
 from skills.formats.archive import Archive, shown
 from skills.formats.bag_folder import METADATA
 from skills.formats.bag_writer import DEFINITIONS, Written, metadata_of
+from skills.formats.checksums import SUMS, digest_of, read_sums
+from skills.formats.columns import in_mm
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Wanted, fields_of
 from skills.formats.mcap.reader import MessageSchema, Walker
-from skills.formats.replay_bag import CRTK_ARMS, SUMS, ArmMotion, Role, arm_names, messages_of, notes_of, velocities_of
+from skills.formats.replay_bag import (
+    CRTK_ARMS,
+    ArmMotion,
+    JawMove,
+    Role,
+    Timetable,
+    arm_names,
+    messages_of,
+    notes_of,
+    velocities_of,
+)
 from skills.formats.topics import JOINT_STATE, POSE
-from skills.kinematics import INSERTION, JOINTS, angle_between, forward, instrument_of, joint_margins, matrix_of
+from skills.kinematics import JOINTS, angle_between, forward, instrument_of, joint_margins, matrix_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import joint_ratios
 from skills.transparency import PublicKey, Statement, read_envelope, read_notes
@@ -40,17 +52,104 @@ PLAN, VERDICT, POLICY, README = "plan.json", "verdict.json", "policy.json", "REA
 EXECUTOR = "executor.json"  # the timetable
 PAPERS = (PLAN, VERDICT, POLICY, README, EXECUTOR)
 SIGNATURE = "signature.dsse"
-BOUND = ("plan", "verdict", "policy", "trajectory")  # digests in the signed statement
 SAMPLES_LIMIT = 2_000_000  # per arm: 200 passes of 50 s at 200 Hz
 FORM_MM, FORM_RAD = 1e-6, 1e-6  # round-off is 1e-13; a joint that is off by a millionth of its range is found
 GOAL_MM = 1e-3  # an exported pass ends within 1e-9 of its path's end
-JUDGED = ("lowest", "highest", "peak_speed_ratio", "peak_acceleration_ratio")  # of each joint, in the verdict
 JUDGED_OFF = 1e-6  # rad, mm, or a part of a limit; metres in the bag leave 1e-9
 SPEED_RATIO = 1.000001  # a tolerance of 1e-6 for round-off, as in the playback's verdict
 
 _UNTYPED = MessageSchema("", "", b"")
-_SUM = re.compile(r"([0-9a-f]{64})  (\S+)")
 _JOINTS = Wanted(("position", "velocity"))
+
+
+# ---- the parts of the papers that are checked -------------------------------------------------------------------
+
+
+class PolicyPaper(BaseModel):
+    """The policy that the plan follows."""
+
+    sha256: StrictStr
+
+
+class PathPaper(BaseModel):
+    """A pass: its path in mm, shape (K, 3)."""
+
+    path_mm: Annotated[list[tuple[float, float, float]], Field(min_length=1)]
+
+
+class SamplingPaper(BaseModel):
+    """The rate and the number of samples of the plan's motion."""
+
+    rate_hz: float
+    samples: int
+
+
+class OtherArmPaper(BaseModel):
+    """PSM_M; without a base it does not move."""
+
+    base_mm: tuple[float, float, float] | None
+    instrument: StrictStr = ""
+
+
+class PlanPaper(BaseModel):
+    """The plan."""
+
+    sha256: StrictStr
+    policy: PolicyPaper
+    arm: StrictStr
+    frame: StrictStr
+    instrument: StrictStr
+    trajectory: SamplingPaper
+    passes: Annotated[list[PathPaper], Field(min_length=1)]
+    psm_m: OtherArmPaper | None
+
+
+class JointPaper(BaseModel):
+    """The judged figures of a joint: its range in rad or mm, and its peaks as parts of the limits."""
+
+    lowest: float
+    highest: float
+    peak_speed_ratio: float
+    peak_acceleration_ratio: float
+
+
+class ArmPaper(BaseModel):
+    """The judged figures of an arm."""
+
+    name: Role
+    joints: Annotated[list[JointPaper], Field(min_length=len(JOINTS), max_length=len(JOINTS))]
+
+
+class ReportPaper(BaseModel):
+    """The report of the verdict."""
+
+    feasible: StrictBool
+    trajectory: StrictStr | None = None
+    arms: list[ArmPaper]
+
+
+class VerdictPaper(BaseModel):
+    """The verdict; `report` is as written, because its digest covers all of it."""
+
+    sha256: StrictStr
+    plan: StrictStr
+    policy: StrictStr
+    feasible: StrictBool
+    report: dict[str, Any]
+
+
+JUDGED = tuple(JointPaper.model_fields)
+Paper = TypeVar("Paper", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Papers:
+    """The documents of a bag, of which plan, verdict and policy belong together."""
+
+    plan: PlanPaper
+    verdict: VerdictPaper
+    report: ReportPaper
+    policy: PolicyPaper
 
 
 def verify_bag(path: Path, key: PublicKey | None = None) -> list[str]:
@@ -75,20 +174,20 @@ def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
     arms = _arms_in(archive.names)
     sums = _check_sums(archive)
     signed, statement = _check_signature(archive, sums, key)
-    plan, verdict, policy = (_paper(archive, name) for name in (PLAN, VERDICT, POLICY))
-    _check_papers(plan, verdict, policy)
-    _check_statement(statement, plan, verdict)
+    papers = _read_papers(archive)
+    plan, verdict = papers.plan, papers.verdict
+    _check_statement(statement, papers)
     motions = [_read_arm(archive, name, plan) for name in arms]
     _check_roles(motions, plan)
-    _check_timetable(_paper(archive, EXECUTOR), plan, motions)
+    _check_timetable(_paper(archive, EXECUTOR, Timetable), plan, motions)
     for motion in motions:
-        _check_judged(motion, verdict["report"])
+        _check_judged(motion, papers.report)
     return [
         f"{len(archive.names)} files, and {SUMS} has the right checksum of each other file.",
-        f"Plan {plan['sha256'][:12]}, the feasible verdict {verdict['sha256'][:12]} and policy {policy['sha256'][:12]} "
+        f"Plan {plan.sha256[:12]}, the feasible verdict {verdict.sha256[:12]} and policy {papers.policy.sha256[:12]} "
         "belong together.",
-        *(_told(motion) for motion in motions),
-        *([] if plan.get("psm_m") else ["It has no hand-off: no PSM_M, no A2."]),
+        *(_describe(motion) for motion in motions),
+        *([] if plan.psm_m else ["It has no hand-off: no PSM_M, no A2."]),
         signed,
     ]
 
@@ -113,17 +212,16 @@ def _arms_in(names: list[str]) -> list[str]:
 
 def _check_sums(archive: Archive) -> dict[str, str]:
     """Return the SHA-256 of each file, in hex by name, after comparing it with the file."""
-    lines = [_SUM.fullmatch(line) for line in archive.text(SUMS).splitlines()]
-    said = {line[2]: line[1] for line in lines if line is not None}
-    if None in lines or len(said) != len(lines) or set(said) != {*archive.names} - {SUMS}:
+    sums = read_sums(archive.text(SUMS))
+    if set(sums) != {*archive.names} - {SUMS}:
         raise BadBag(f"{SUMS} must list every other file of the bag exactly once, and no others. Export it again.")
-    for name, digest in sorted(said.items()):
+    for name, digest in sorted(sums.items()):
         with archive.unpacked(name) as file:
-            if _digest(file) != digest:
+            if digest_of(file) != digest:
                 raise BadBag(
                     f"{name} does not match its checksum in {SUMS}: it was changed or damaged. Export it again."
                 )
-    return said
+    return sums
 
 
 def _check_signature(archive: Archive, sums: dict[str, str], key: PublicKey | None) -> tuple[str, Statement | None]:
@@ -149,76 +247,75 @@ def _check_signature(archive: Archive, sums: dict[str, str], key: PublicKey | No
     return f"Signed with the key {key.number}, under the history of {size} leaves with the root {root[:12]}.", statement
 
 
-def _check_statement(statement: Statement | None, plan: dict[str, Any], verdict: dict[str, Any]) -> None:
+def _check_statement(statement: Statement | None, papers: Papers) -> None:
     """Check that what was signed is about this plan, its verdict, its policy and the motion that was judged."""
-    if statement is None:
-        return
-    said = {name: statement.facts.get(name) for name in ("kind", *BOUND)}
-    here = ("replay-bag", plan["sha256"], verdict["sha256"], verdict["policy"], verdict["report"].get("trajectory"))
-    if said != dict(zip(said, here, strict=True)):
+    expected = {
+        "kind": "replay-bag",
+        "plan": papers.plan.sha256,
+        "verdict": papers.verdict.sha256,
+        "policy": papers.policy.sha256,
+        "trajectory": papers.report.trajectory,
+    }
+    if statement is not None and {name: statement.facts.get(name) for name in expected} != expected:
         raise BadBag(f"{SIGNATURE} is about another plan, verdict, policy or motion. Export the bag again.")
 
 
-def _digest(file: BinaryIO) -> str:
-    seen = hashlib.sha256()
-    while data := file.read(1 << 20):
-        seen.update(data)
-    return seen.hexdigest()
-
-
-def _paper(archive: Archive, name: str) -> dict[str, Any]:
+@contextmanager
+def _valid(name: str) -> Iterator[None]:
     try:
-        paper = json.loads(archive.text(name))
-    except (ValueError, RecursionError):
-        paper = None
-    if not isinstance(paper, dict):
-        raise BadBag(f"{name} is not a JSON object. Export the bag again.")
-    return paper
+        yield
+    except ValidationError as error:
+        if error.errors()[0]["type"] in ("json_invalid", "model_type") and not error.errors()[0]["loc"]:
+            raise BadBag(f"{name} is not a JSON object. Export the bag again.") from error
+        raise BadBag(f"{name} has a missing or invalid field. Export the bag again.") from error
 
 
-def _check_papers(plan: dict[str, Any], verdict: dict[str, Any], policy: dict[str, Any]) -> None:
-    """Check that plan, verdict and policy belong together, and that the verdict is feasible and unchanged."""
-    try:
-        plan_sha256, report = plan["sha256"], verdict["report"]
-        policies = {plan["policy"]["sha256"], verdict["policy"], policy["sha256"]}
-        if verdict["plan"] != plan_sha256:
-            raise BadBag(f"{VERDICT} belongs to another plan than {PLAN}. Export the bag again.")
-        if len(policies) != 1:
-            raise BadBag(f"{PLAN}, {VERDICT} and {POLICY} name {len(policies)} policies. Export the bag again.")
-        if verdict["feasible"] is not True or report["feasible"] is not True:
-            raise BadBag(f"{VERDICT} does not find the plan feasible; it must not be played.")
-        if sha256(canonical([plan_sha256, report])) != verdict["sha256"]:
-            raise BadBag(f"{VERDICT} does not match its digest. Export the bag again.")
-    except (LookupError, TypeError, ValueError) as error:
-        raise BadBag(f"{PLAN}, {VERDICT} or {POLICY} has a missing or invalid field. Export the bag again.") from error
+def _paper(archive: Archive, name: str, kind: type[Paper]) -> Paper:
+    with _valid(name):
+        return kind.model_validate_json(archive.text(name))
 
 
-def _check_timetable(paper: dict[str, Any], plan: dict[str, Any], motions: list[ArmMotion]) -> None:
+def _read_papers(archive: Archive) -> Papers:
+    """Read plan, verdict and policy, which must belong together; the verdict must be feasible and unchanged."""
+    plan, policy = _paper(archive, PLAN, PlanPaper), _paper(archive, POLICY, PolicyPaper)
+    verdict = _paper(archive, VERDICT, VerdictPaper)
+    if verdict.plan != plan.sha256:
+        raise BadBag(f"{VERDICT} belongs to another plan than {PLAN}. Export the bag again.")
+    policies = {plan.policy.sha256, verdict.policy, policy.sha256}
+    if len(policies) != 1:
+        raise BadBag(f"{PLAN}, {VERDICT} and {POLICY} name {len(policies)} policies. Export the bag again.")
+    if sha256(canonical([plan.sha256, verdict.report])) != verdict.sha256:
+        raise BadBag(f"{VERDICT} does not match its digest. Export the bag again.")
+    with _valid(VERDICT):
+        report = ReportPaper.model_validate(verdict.report)
+    if not (verdict.feasible and report.feasible):
+        raise BadBag(f"{VERDICT} does not find the plan feasible; it must not be played.")
+    return Papers(plan, verdict, report, policy)
+
+
+def _check_timetable(timetable: Timetable, plan: PlanPaper, motions: list[ArmMotion]) -> None:
     """Check that the timetable is this plan's, and that both arms have a setpoint at every one of its stamps.
 
     And that jaws are as stated when they have moved, each after the one before.
     """
-    try:
-        parts = [part for one in paper["passes"] for part in one["phases"]]
-        stamps = [part[end] for part in parts for end in ("from_ns", "to_ns")]
-        changes = [one.get(kind) for one in paper["passes"] for kind in ("hand_over", "take_back")]
-        stamps += [one["at_ns"] for one in changes if one is not None]
-        known = all(np.isin(stamps, motion.stamps_ns).all() for motion in motions)
-        known = known and all(_in_order(one["jaws_in_order"], motions) for one in changes if one is not None)
-        if paper["plan"] != plan["sha256"] or not stamps or not known:
-            raise BadBag(f"{EXECUTOR} is not the timetable of this bag. Export the bag again.")
-    except (LookupError, TypeError, ValueError) as error:
-        raise BadBag(f"{EXECUTOR} has a missing or invalid field. Export the bag again.") from error
+    changes = [one for times in timetable.passes for one in (times.hand_over, times.take_back) if one is not None]
+    stamps_ns = [ns for times in timetable.passes for phase in times.phases for ns in (phase.from_ns, phase.to_ns)]
+    stamps_ns += [change.at_ns for change in changes]
+    known = all(np.isin(stamps_ns, motion.stamps_ns).all() for motion in motions)
+    in_order = known and all(_in_order(change.jaws_in_order, motions) for change in changes)
+    if timetable.plan != plan.sha256 or not stamps_ns or not in_order:
+        raise BadBag(f"{EXECUTOR} is not the timetable of this bag. Export the bag again.")
 
 
-def _in_order(jaws: list[dict[str, Any]], motions: list[ArmMotion]) -> bool:
+def _in_order(jaws: list[JawMove], motions: list[ArmMotion]) -> bool:
     """Return whether the jaws move one after the other to the stated angles."""
-    arms = {motion.name: motion for motion in motions}
-    for one in jaws:
-        at = arms[one["arm"]].stamps_ns == one["to_ns"]
-        if not (at.any() and (arms[one["arm"]].jaw_rad[at] == one["jaw_rad"]).all()):
-            return False
-    return all(first["to_ns"] <= second["from_ns"] for first, second in pairwise(jaws))
+    reached = {
+        (motion.name, ns, rad)
+        for motion in motions
+        for ns, rad in zip(motion.stamps_ns.tolist(), motion.jaw_rad.tolist(), strict=True)
+    }
+    stated = all((jaw.arm, jaw.to_ns, jaw.jaw_rad) in reached for jaw in jaws)
+    return stated and all(first.to_ns <= second.from_ns for first, second in pairwise(jaws))
 
 
 # ---- one arm ----------------------------------------------------------------------------------------------------
@@ -230,7 +327,6 @@ class _Topic:
 
     type: str
     wanted: Wanted
-    log_ns: list[Ints] = field(default_factory=list)
     columns: list[Columns] = field(default_factory=list)
     messages: list[bytes] = field(default_factory=list)
 
@@ -248,7 +344,7 @@ class _Topic:
         return np.concatenate([columns.values for columns in self.columns])
 
 
-def _read_arm(archive: Archive, name: str, plan: dict[str, Any]) -> ArmMotion:
+def _read_arm(archive: Archive, name: str, plan: PlanPaper) -> ArmMotion:
     """Read one arm's folder, and run all checks that concern this arm alone."""
     file_name = f"{name}.mcap"
     with archive.unpacked(f"{name}/{file_name}") as file:
@@ -285,7 +381,6 @@ def _walk(file: BinaryIO, name: str) -> tuple[Walker, dict[str, _Topic]]:
                 raise BadBag(f"{topic} does not have the type {said.type}. Export the bag again.")
             decoders[topic] = Decoder(topic, fields_of(schema.name, schema.definition.decode()), said.wanted)
         said.columns.append(decoders[topic].decode(data, part.begin, part.length))
-        said.log_ns.append(part.log_ns.astype(np.int64))
         spans = zip(part.begin.tolist(), part.length.tolist(), strict=True)
         said.messages += [data[begin : begin + length].tobytes() for begin, length in spans]
         if len(said.messages) > SAMPLES_LIMIT:
@@ -295,7 +390,7 @@ def _walk(file: BinaryIO, name: str) -> tuple[Walker, dict[str, _Topic]]:
     return walker, topics
 
 
-def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: dict[str, Any]) -> ArmMotion:
+def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: PlanPaper) -> ArmMotion:
     """Convert the messages that were read back into an `ArmMotion`."""
     on_joints, on_tip, on_jaw = topics.values()
     counts = [len(said.messages) for said in (on_joints, on_tip, on_jaw)]
@@ -316,8 +411,8 @@ def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: d
         instrument_of(instrument := notes["instrument"])
         role: Role = "PSM_A" if notes["role"] == "PSM_A" else "PSM_M"
         rate_hz, number = float(notes["rate_hz"]), notes["pass"]
-        frame = plan["frame"] if role == "PSM_A" else f"{name}_base"
-        if not (10 <= rate_hz <= 2000 and isinstance(frame, str) and (number == "all" or number.isdecimal())):
+        frame = plan.frame if role == "PSM_A" else f"{name}_base"
+        if not (10 <= rate_hz <= 2000 and (number == "all" or number.isdecimal())):
             raise ValueError(number)
     except (LookupError, ValueError, UnknownInstrument) as error:
         raise BadBag(f"{name}.mcap does not name its role, its instrument and its rate. Export it again.") from error
@@ -359,7 +454,8 @@ def _check_stamps(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
             sample=sample,
         )
     for topic, said in topics.items():
-        if not (np.array_equal(said.stamps_ns, stamps_ns) and np.array_equal(np.concatenate(said.log_ns), stamps_ns)):
+        log_ns = np.concatenate([columns.log_ns for columns in said.columns])
+        if not (np.array_equal(said.stamps_ns, stamps_ns) and np.array_equal(log_ns, stamps_ns)):
             raise BadBag(
                 f"{topic} has stamps or log times that differ from those of {motion.topics[0]}. Export it again."
             )
@@ -369,13 +465,13 @@ def _check_joints(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
     """Check that positions and speeds of the joints are within their limits, and that velocities match positions."""
     on_joints, _, on_jaw = topics.values()
     tool = instrument_of(motion.instrument)
-    joints = _in_mm(motion.joints)
-    _first("is beyond its limit", motion, joint_margins(joints, motion.instrument) >= -1e-9)
+    joints = in_mm(motion.joints)
+    _check_samples("is beyond its limit", motion, joint_margins(joints, motion.instrument) >= -1e-9)
     tick_s = 1.0 / motion.rate_hz  # over a pause too: a robot moves to the next setpoint only when it arrives
     speeds = np.abs(np.diff(joints, axis=0, prepend=joints[:1])) / tick_s / tool.speed
-    _first("jumps: it would be faster than its limit", motion, speeds <= SPEED_RATIO)
+    _check_samples("jumps: it would be faster than its limit", motion, speeds <= SPEED_RATIO)
     velocities = velocities_of(motion.stamps_ns, motion.joints, motion.rate_hz)
-    _first(
+    _check_samples(
         "has a velocity that does not match the differences of its positions",
         motion,
         on_joints.values[:, len(JOINTS) :] == velocities,
@@ -388,7 +484,7 @@ def _check_joints(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
         )
 
 
-def _first(what: str, motion: ArmMotion, good: np.ndarray[Any, np.dtype[np.bool_]]) -> None:
+def _check_samples(what: str, motion: ArmMotion, good: Flags) -> None:
     """Raise an error for the first sample and joint that fails a check.
 
     Args:
@@ -426,14 +522,14 @@ def _off_the_form(motion: ArmMotion) -> tuple[float, float]:
     length = np.linalg.norm(motion.rotation_xyzw, axis=1)
     if not (np.abs(length - 1.0) <= FORM_RAD).all():
         return np.nan, np.nan
-    tip_mm, rotation = forward(_in_mm(motion.joints), motion.instrument)
+    tip_mm, rotation = forward(in_mm(motion.joints), motion.instrument)
     apart_mm = np.linalg.norm(1000.0 * motion.tip_m - tip_mm, axis=1)
     return float(apart_mm.max()), float(angle_between(matrix_of(motion.rotation_xyzw), rotation).max())
 
 
-def _check_written(motion: ArmMotion, notes: dict[str, str], topics: dict[str, _Topic], plan: dict[str, Any]) -> None:
+def _check_written(motion: ArmMotion, notes: dict[str, str], topics: dict[str, _Topic], plan: PlanPaper) -> None:
     """Write the arm's messages again and compare them byte for byte, which covers names, frames and all else."""
-    if notes != notes_of(motion, plan["sha256"]):
+    if notes != notes_of(motion, plan.sha256):
         raise BadBag(f"{motion.name}.mcap was made from another plan than {PLAN}. Export the bag again.")
     left = {topic: iter(said.messages) for topic, said in topics.items()}
     if any(next(left[message.topic]) != message.data for message in messages_of(motion)):
@@ -443,25 +539,22 @@ def _check_written(motion: ArmMotion, notes: dict[str, str], topics: dict[str, _
 # ---- the arms together ------------------------------------------------------------------------------------------
 
 
-def _check_roles(motions: list[ArmMotion], plan: dict[str, Any]) -> None:
+def _check_roles(motions: list[ArmMotion], plan: PlanPaper) -> None:
     """Check that one arm of the bag executes the plan, and that the other one matches it.
 
     The first must have the plan's arm, instrument, rate and number of samples, and end where the plan does.
     """
     planned = [motion for motion in motions if motion.role == "PSM_A"]
-    try:
-        if [one.name for one in planned] != [arm_names(plan["arm"])[0]]:
-            raise BadBag(f"The plan is for {plan['arm']}, but the bag has another PSM_A, or none.")
-        psm_a, asked = planned[0], plan["trajectory"]
-        last = plan["passes"][-1 if psm_a.pass_index is None else psm_a.pass_index]
-        goal_mm = np.array(last["path_mm"][-1], dtype=np.float64)
-        same = (psm_a.instrument, psm_a.rate_hz) == (plan["instrument"], asked["rate_hz"])
-        other = plan["psm_m"] or {"base_mm": None}
-        others = [] if other["base_mm"] is None else [other["instrument"]]
-        whole = psm_a.pass_index is not None or len(psm_a.stamps_ns) == asked["samples"]
-        off_mm = float(np.linalg.norm(1000.0 * psm_a.tip_m[-1] - goal_mm))
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise BadBag(f"{PLAN} has a missing or invalid field. Export the bag again.") from error
+    if [one.name for one in planned] != [arm_names(plan.arm)[0]]:
+        raise BadBag(f"The plan is for {plan.arm}, but the bag has another PSM_A, or none.")
+    psm_a, other = planned[0], plan.psm_m
+    if (psm_a.pass_index or 0) >= len(plan.passes):
+        raise BadBag(f"{psm_a.name} is of a pass that {PLAN} does not have. Export the bag again.")
+    goal_mm = plan.passes[-1 if psm_a.pass_index is None else psm_a.pass_index].path_mm[-1]
+    same = (psm_a.instrument, psm_a.rate_hz) == (plan.instrument, plan.trajectory.rate_hz)
+    others = [] if other is None or other.base_mm is None else [other.instrument]
+    whole = psm_a.pass_index is not None or len(psm_a.stamps_ns) == plan.trajectory.samples
+    off_mm = float(np.linalg.norm(1000.0 * psm_a.tip_m[-1] - goal_mm))
     if not (same and whole):
         raise BadBag(f"{psm_a.name} has another instrument, rate or number of samples than {PLAN}.")
     if [motion.instrument for motion in motions if motion.role == "PSM_M"] != others:
@@ -472,22 +565,21 @@ def _check_roles(motions: list[ArmMotion], plan: dict[str, Any]) -> None:
         raise BadBag("The two arms have different stamps; they would not move together. Export the bag again.")
 
 
-def _check_judged(motion: ArmMotion, report: dict[str, Any]) -> None:
+def _check_judged(motion: ArmMotion, report: ReportPaper) -> None:
     """Check the accelerations, and that the joints' ranges, speeds and accelerations are those that were judged.
 
     A single pass must stay within those of the whole plan.
     """
-    joints = _in_mm(motion.joints)
+    joints = in_mm(motion.joints)
     all_one = np.zeros(len(joints), np.int64)  # as the verdict has it: neither arm may jump between passes
     speed, acceleration = joint_ratios(joints, all_one, motion.rate_hz, motion.instrument)
-    _first("accelerates beyond its limit", motion, acceleration <= SPEED_RATIO)
-    try:
-        (said,) = [one["joints"] for one in report["arms"] if one["name"] == motion.role]
-        judged = np.array([[joint[name] for joint in said] for name in JUDGED], dtype=np.float64)
-        here = np.stack([joints.min(axis=0), joints.max(axis=0), speed.max(axis=0), acceleration.max(axis=0)])
-        off = (here - judged) * np.array([[-1.0], [1.0], [1.0], [1.0]])  # above 0: beyond what was judged
-    except (LookupError, TypeError, ValueError) as error:
-        raise BadBag(f"{VERDICT} has a missing or invalid field. Export the bag again.") from error
+    _check_samples("accelerates beyond its limit", motion, acceleration <= SPEED_RATIO)
+    arms = [arm for arm in report.arms if arm.name == motion.role]
+    if len(arms) != 1:
+        raise BadBag(f"{VERDICT} has a missing or invalid field: {motion.role}. Export the bag again.")
+    judged = np.array([[getattr(joint, figure) for joint in arms[0].joints] for figure in JUDGED])
+    here = np.stack([joints.min(axis=0), joints.max(axis=0), speed.max(axis=0), acceleration.max(axis=0)])
+    off = (here - judged) * np.array([[-1.0], [1.0], [1.0], [1.0]])  # above 0: beyond what was judged
     within = off <= JUDGED_OFF if motion.pass_index is not None else np.abs(off) <= JUDGED_OFF
     if not within.all():
         figure, joint = (int(index) for index in np.argwhere(~within)[0])
@@ -498,7 +590,7 @@ def _check_judged(motion: ArmMotion, report: dict[str, Any]) -> None:
         )
 
 
-def _told(motion: ArmMotion) -> str:
+def _describe(motion: ArmMotion) -> str:
     """Return the summary of an arm's checks, with the bounding box of its motion."""
     off_mm, _ = _off_the_form(motion)
     low, high = motion.extent_mm.tolist()
@@ -509,10 +601,3 @@ def _told(motion: ArmMotion) -> str:
         "stamps, jaw and velocities correct, joints and their speeds within the limits, the tip within "
         f"{off_mm:.1g} mm of the closed form; {box} mm in {motion.frame}."
     )
-
-
-def _in_mm(joints: Floats) -> Floats:
-    """Return joints in the domain's units: the insertion in mm."""
-    in_mm = joints.copy()
-    in_mm[:, INSERTION] *= 1000.0
-    return in_mm

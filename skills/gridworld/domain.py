@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from skills.arrays import Floats, Ints
+from skills.arrays import Flags, Floats, Ints
 from skills.errors import BadSettings
 from skills.gridworld.grid import MOVES, GridPath, moves_between
 from skills.gridworld.reward import RewardMap
@@ -109,17 +109,17 @@ class Domain:
         return self.path.grid.states_of(self.cell_of)
 
     @cached_property
-    def certified(self) -> NDArray[np.bool_]:
+    def certified(self) -> Flags:
         """Flags of the rows in the certified domain, (rows,); false only at some corners of the boxes."""
         return self.holds(self.phase_of, self.cell_of)
 
     @cached_property
-    def terminal(self) -> NDArray[np.bool_]:
+    def terminal(self) -> Flags:
         """Flags of the rows where the task is finished, (rows,): the goal in the last phase, by rule in phase 0 too."""
         ends = (self.phase_of == 0) & self.finishes_unjoined | (self.phase_of == self.phases - 1)
         return np.asarray(ends & (self.state_of == self.path.goal))
 
-    def holds(self, phases: ArrayLike, cells: ArrayLike) -> NDArray[np.bool_]:
+    def holds(self, phases: ArrayLike, cells: ArrayLike) -> Flags:
         """Return for each pair of a phase and a cell whether it is in the certified domain.
 
         Args:
@@ -160,7 +160,7 @@ class Domain:
         return not self.phased or self.join_share == 0
 
     @cached_property
-    def may_join(self) -> NDArray[np.bool_]:
+    def may_join(self) -> Flags:
         """Flags of the waypoints at which the path may be joined, (R,): the first ones, with enough left."""
         moves = len(self.path.states) - 1
         # A quotient of integers, so that a share such as 0.7 is met exactly where 7 of 10 moves are left.
@@ -182,7 +182,7 @@ class Domain:
         return joins
 
     @cached_property
-    def may_meet(self) -> NDArray[np.bool_]:
+    def may_meet(self) -> Flags:
         """Flags of the states at which an unjoined pass meets the path, (n_states,): it joins or finishes there."""
         meets = np.zeros(self.path.grid.n_states, np.bool_)
         meets[self.path.states[self.may_join] if self.phased else self.path.states] = True
@@ -201,35 +201,45 @@ class Domain:
             return reward.rewards
         return np.where(self.joins > 0, reward.levels.visited, reward.levels.other)
 
-    def start(self, state: int) -> tuple[int, bool]:
-        """Return the phase of a pass that starts in a state, and whether it is finished there already."""
-        if not self.phased:
-            return 0, state == self.path.goal
-        visits = np.flatnonzero(self.path.states == state)
-        if len(visits) == 0 or not self.may_join[visits[0]]:
-            return 0, False
-        first = int(visits[0])
-        done = first == self.phases - 1
-        return (first if done else first + 1), done
+    def start(self, states: ArrayLike) -> tuple[Ints, Flags]:
+        """Return the phase of a pass that starts in each state, and whether it is finished there already.
+
+        Args:
+            states: States, shape (...,).
+
+        Returns:
+            Phases and flags, both of shape (...,).
+        """
+        states = np.asarray(states)
+        at_goal = states == self.path.goal
+        first = int(np.argmax(self.path.states == self.path.goal))
+        ends = not self.phased or (first == self.phases - 1 and self.may_join[first])
+        # A start on the path counts as the move onto it, but for the goal, where moving onto it may finish.
+        goal_phase = (first + (first < self.phases - 1)) if self.phased and self.may_join[first] else 0
+        return np.where(at_goal, goal_phase, self.joins[states]), at_goal & ends
 
     @cached_property
     def start_rows(self) -> Ints:
         """The row in which a pass from each state begins, (n_states,); -1 where it is finished there already."""
-        states, goal = np.arange(self.path.grid.n_states), self.path.goal
-        phases = self.joins.copy()  # a start on the path counts as the move onto it, but for the goal
-        phases[goal], done = self.start(goal)
-        rows = self.rows_of(phases, self.path.grid.cells_of(states))
-        rows[goal] = -1 if done else rows[goal]
-        return rows
+        states = np.arange(self.path.grid.n_states)
+        phases, done = self.start(states)
+        return np.where(done, -1, self.rows_of(phases, self.path.grid.cells_of(states)))
 
-    def enter(self, phase: int, state: int) -> tuple[int, bool]:
-        """Return the phase after moving onto a state (or staying in it) in a phase, and whether that finishes."""
-        if phase == 0:
-            return int(self.joins[state]), self.finishes_unjoined and state == self.path.goal
-        if state != self.path.states[phase]:
-            return phase, False
-        done = phase == self.phases - 1
-        return (phase if done else phase + 1), done
+    def enter(self, phases: ArrayLike, states: ArrayLike) -> tuple[Ints, Flags]:
+        """Return the phase after moving onto each state (or staying in it) in a phase, and whether that finishes.
+
+        Args:
+            phases: Phases before the moves, shape (...,).
+            states: States moved onto, shape (...,).
+
+        Returns:
+            Phases and flags, both of shape (...,).
+        """
+        phases, states = np.asarray(phases), np.asarray(states)
+        ahead = (phases > 0) & (states == self.path.states[phases])
+        unjoined = (states == self.path.goal) & self.finishes_unjoined
+        finishes = np.where(phases == 0, unjoined, ahead & (phases == self.phases - 1))
+        return np.where(phases == 0, self.joins[states], phases + (ahead & ~finishes)), finishes
 
     def move(self, rows: Ints, actions: Ints) -> "Moves":
         """Take an action in each of some rows, without slips.
@@ -246,16 +256,14 @@ class Domain:
         off_grid = ~self.path.grid.holds(cells)
         cells = np.where(off_grid[:, None], here, cells)  # before `states_of`, which refuses cells off the grid
         state = self.path.grid.states_of(cells)
-        ahead = ~off_grid & (phase > 0) & (state == self.path.states[phase])
-        joins = np.where(off_grid | (phase > 0), 0, self.joins[state])
-        at_goal = ~off_grid & (phase == 0) & (state == self.path.goal) & self.finishes_unjoined
-        finishes = at_goal | (ahead & (phase == self.phases - 1))
-        after = np.where(joins > 0, joins, phase + (ahead & ~finishes))
+        after, finishes = self.enter(phase, state)
+        after, finishes = np.where(off_grid, phase, after), finishes & ~off_grid
+        advances = (phase > 0) & (after > phase)
         inside = self.holds(after, cells) & ~finishes
         row_after = np.full(len(rows), -1, np.int64)
         # Only where it is inside: cells beyond the box of a phase have no row.
         row_after[inside] = self.rows_of(after[inside], cells[inside])
-        return Moves(row_after, state, finishes, ahead & ~finishes, off_grid)
+        return Moves(row_after, state, finishes, advances, off_grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,6 +280,6 @@ class Moves:
 
     row: Ints
     state: Ints
-    finishes: NDArray[np.bool_]
-    advances: NDArray[np.bool_]
-    off_grid: NDArray[np.bool_]
+    finishes: Flags
+    advances: Flags
+    off_grid: Flags

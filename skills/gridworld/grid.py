@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Floats, Ints, frozen, xyz
+from skills.arrays import Floats, Ints, freeze, frozen, xyz
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.quality import times_in_words
 from skills.errors import BadPath, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
@@ -189,7 +189,7 @@ class GridPath:
 
     def __post_init__(self) -> None:
         _check_hysteresis(self.hysteresis)
-        object.__setattr__(self, "states", frozen(self.states, np.int64, (None,), "states"))
+        freeze(self, np.int64, states=(None,))
         if len(self.states) == 0:
             raise EmptyPath("The path has no points; give at least two positions.")
         if self.states.min() < 0 or self.states.max() >= self.grid.n_states:

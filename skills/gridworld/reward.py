@@ -5,7 +5,7 @@ from math import isfinite
 
 import numpy as np
 
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze
 from skills.errors import BadSettings
 from skills.fields import schema
 from skills.gridworld.grid import GridPath
@@ -47,7 +47,7 @@ class RewardMap:
     rewards: Floats
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rewards", frozen(self.rewards, np.float64, (self.path.grid.n_states,), "rewards"))
+        freeze(self, rewards=(self.path.grid.n_states,))
 
 
 def sparse_reward(path: GridPath, levels: RewardLevels | None = None) -> RewardMap:

@@ -1,22 +1,8 @@
-"""The scene around a demonstration: what an arm must not touch, in the grid world; all of this is ours.
-
-    Scene, GridPath --hazards_of--> Hazards: the moves that touch, and the cost of entering each cell
-
-A policy keeps the scene that it was learnt in, with its costs, as `Surroundings`.
+"""The scene around a demonstration: what an arm must not touch; all of this is ours.
 
 A *scene* has keep-out boxes, capsules (the links of another arm) and tissue, in the frame of the demonstration, in mm.
-Each is grown by `margin_mm`. A *cell* is forbidden if its centre touches something, because centres are what a policy
-commands; a *move* touches if the straight line between the two centres does, so no move passes through a thin box. The
-distance of the tip from the centre of its cell, and the size of the tool, belong into the margin.
-
-Tissue is a plane or a height map above a plane, also that of a mesh: it is nowhere below the mesh, so that what keeps
-off the map keeps off the tissue.
-
-    points, triangles --tissue_of_mesh--> Tissue
-
-The highest place of a mesh in a square of the map is at a point of the mesh, where an edge crosses the square's border,
-or at the square's corner. A corner of the map gets the highest of these within one step of it, along each axis. Each
-square has four such corners, so the surface between them, which is bilinear, is nowhere below the mesh.
+Each is grown by `margin_mm`. Tissue is a plane or a height map above a plane (`skills.gridworld.mesh`: of a mesh).
+`skills.gridworld.hazards` puts a scene into the grid world.
 """
 
 from collections.abc import Mapping
@@ -28,13 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import product
-from skills.arrays import Flags, Floats, Ints, xyz
+from skills.arrays import Flags, Floats, xyz
 from skills.errors import BadSettings
 from skills.fields import Point, schema
-from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.quaternions import unit
 
-STAY = 13  # the action that stays: (0, 0, 0), the middle one of the moves
 SAMPLES_A_STEP = 4  # a move is compared with tissue at points at most a quarter of the map's step apart
 MOST_BODIES = 64  # ours, boxes or capsules: two arms have twenty links, and each body is compared with every move
 MOST_HEIGHTS = 10_000  # ours, of a height map: 100 mm by 100 mm at 1 mm, some 200 kB of JSON
@@ -103,10 +87,8 @@ class Capsule:
 
     def from_lines_mm(self, a_mm: Floats, b_mm: Floats) -> Floats:
         """Return the distances of straight lines between points, (..., 3), from the capsule, (...,); < 0 inside."""
-        apart = _between_segments_mm(a_mm, b_mm, np.array(self.a_mm), np.array(self.b_mm))
-        # where a coordinate is NaN, the nearest ends may be finite
-        known = np.isfinite(a_mm).all(axis=-1) & np.isfinite(b_mm).all(axis=-1)
-        return np.asarray(np.where(known, apart - self.radius_mm, np.nan))
+        begin = np.array(self.a_mm)
+        return segments_apart(a_mm, b_mm - a_mm, begin, self.b_mm - begin) - self.radius_mm
 
 
 @schema
@@ -244,7 +226,7 @@ class Scene:
 
     def as_json(self) -> dict[str, Any]:
         """Return the scene as plain JSON, of which `skills.packing` computes a digest."""
-        return {name: _lists(value) for name, value in asdict(self).items()}
+        return {name: plain_json(value) for name, value in asdict(self).items()}
 
     @classmethod
     def of_json(cls, described: Mapping[str, Any]) -> "Scene":
@@ -277,8 +259,7 @@ class Scene:
             outside = np.maximum(np.maximum(box.low_mm - points, points - box.high_mm), 0.0)
             nearest = np.minimum(nearest, np.linalg.norm(outside, axis=-1))
         for capsule in self.capsules:
-            apart = _between_segments_mm(points, points, np.array(capsule.a_mm), np.array(capsule.b_mm))
-            nearest = np.minimum(nearest, apart - capsule.radius_mm)
+            nearest = np.minimum(nearest, capsule.from_lines_mm(points, points))
         if self.tissue is not None:
             nearest = np.minimum(nearest, self.tissue.above_mm(points))
         return np.maximum(nearest - self.margin_mm, 0.0)
@@ -308,8 +289,7 @@ class Scene:
         for box in self.boxes:
             touched |= _crosses(a, b, np.array(box.low_mm) - self.margin_mm, np.array(box.high_mm) + self.margin_mm)
         for capsule in self.capsules:
-            apart = _between_segments_mm(a, b, np.array(capsule.a_mm), np.array(capsule.b_mm))
-            touched |= ~(apart > capsule.radius_mm + self.margin_mm)
+            touched |= ~(capsule.from_lines_mm(a, b) > self.margin_mm)
         if self.tissue is not None:
             steps = 0.0 if self.tissue.flat else SAMPLES_A_STEP / self.tissue.step_mm
             pieces = 1 + np.floor(steps * np.linalg.norm(b - a, axis=-1))
@@ -319,156 +299,21 @@ class Scene:
         return touched
 
 
-@schema
-@dataclass(frozen=True)
-class SceneCosts:
-    """Costs in addition to the rewards of Algorithm 1; the paper has none.
-
-    Attributes:
-        touch: Of touching, which ends the pass. More than a path of 90 states can earn, so no style is worth a touch.
-        close: Of entering a cell whose centre touches, less with its clearance, down to 0 at `close_mm`.
-        close_mm: Clearance from which on a cell costs nothing.
-        deeper_per_mm: Of entering a cell, for each mm that it is deeper than all states of the demonstration, along
-            the normal of the tissue.
-    """
-
-    touch: float = 100.0
-    close: float = 0.1
-    close_mm: float = 5.0
-    deeper_per_mm: float = 0.01
-
-    def __post_init__(self) -> None:
-        costs = astuple(self)
-        if not (all(map(isfinite, costs)) and min(costs) >= 0 and self.touch > 0 and self.close_mm > 0):
-            raise BadSettings("Costs must be finite and 0 or more; `touch` and `close_mm` positive.", costs=costs)
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """A scene, and the costs with which a policy is learnt in it."""
-
-    scene: Scene
-    costs: SceneCosts = SceneCosts()
-
-    def as_json(self) -> dict[str, Any]:
-        """Return both as plain JSON."""
-        return {"scene": self.scene.as_json(), "costs": _lists(asdict(self.costs))}
-
-    @classmethod
-    def of_json(cls, described: Mapping[str, Any]) -> "Surroundings":
-        """Return both from their JSON.
-
-        Raises:
-            BadSettings: As for `Scene.of_json`; or a cost is out of range.
-        """
-        return cls(Scene.of_json(described["scene"]), SceneCosts(**described["costs"]))
-
-
-@dataclass(frozen=True, eq=False)
-class Hazards:
-    """A scene on a grid.
-
-    Attributes:
-        touches: Whether the move by each action from each state touches, (n_states, 27); off the grid it stays.
-        cost: Cost of entering each state, (n_states,).
-        surroundings: The scene, and its costs.
-    """
-
-    touches: Flags
-    cost: Floats
-    surroundings: Surroundings
-
-    @property
-    def touch(self) -> float:
-        """The cost of touching."""
-        return self.surroundings.costs.touch
-
-    @property
-    def forbidden(self) -> Flags:
-        """Whether the centre of each state's cell touches, (n_states,)."""
-        return np.asarray(self.touches[:, STAY])
-
-
-def hazards_of(scene: Scene, path: GridPath, frame: str, costs: SceneCosts | None = None) -> Hazards:
-    """Return which moves of a path's grid touch a scene, and the cost of each state.
-
-    Args:
-        scene: The scene, in the frame of the path.
-        path: The demonstrated path.
-        frame: The frame of the path.
-        costs: The costs; None for the defaults.
-
-    Returns:
-        The hazards.
-
-    Raises:
-        BadSettings: The scene is in another frame; or the demonstration itself touches it, and cannot be followed.
-    """
-    refuse_unfit(scene, path, frame)
-    costs, grid = costs or SceneCosts(), path.grid
-    states = np.arange(grid.n_states)
-    centres = grid.centres_mm(states)
-    touches = np.stack([touching(scene, grid, states, np.full(len(states), a)) for a in range(len(MOVES))], axis=1)
-    cost = costs.close * (1 - scene.clearance_mm(centres) / costs.close_mm).clip(0)
-    if scene.tissue is not None:
-        below_mm = scene.tissue.above_mm(path.tip_mm).min() - scene.tissue.above_mm(centres)
-        cost = cost + costs.deeper_per_mm * below_mm.clip(0)
-    return Hazards(touches, np.asarray(cost), Surroundings(scene, costs))
-
-
-def refuse_unfit(scene: Scene, path: GridPath, frame: str) -> None:
-    """Refuse a scene in which a demonstration cannot be followed.
-
-    Args:
-        scene: The scene.
-        path: The demonstrated path.
-        frame: The frame of the path.
-
-    Raises:
-        BadSettings: The scene is in another frame, or the demonstration itself touches it.
-    """
-    if scene.frame != frame:
-        raise BadSettings(
-            f"The scene is in the frame '{scene.frame}', the demonstration in '{frame}'; give the scene in that frame."
-        )
-    bad = np.flatnonzero(scene.touches(path.tip_mm[:-1], path.tip_mm[1:]))
-    if len(bad):
-        x, y, z = path.tip_mm[bad[0]]
-        raise BadSettings(
-            f"The demonstration itself touches the scene in {len(bad)} of {len(path.states) - 1} moves, first from "
-            f"({x:.1f}, {y:.1f}, {z:.1f}) mm; check the scene's frame and margin, or record the hand-off further away.",
-            moves=len(bad),
-        )
-
-
-def touching(scene: Scene, grid: GridWorld, states: Ints, actions: Ints) -> Flags:
-    """Return for each state and action whether the move touches a scene; off the grid it stays.
-
-    Args:
-        scene: The scene, in the frame of the grid.
-        grid: The grid world.
-        states: States, shape (N,).
-        actions: The action in each, 0 to 26, shape (N,).
-
-    Returns:
-        Whether the straight line between the centres of the two cells comes within the scene's margin, shape (N,).
-    """
-    cells = grid.cells_of(states)
-    after = cells + MOVES[actions]
-    after = np.where(grid.holds(after)[:, None], after, cells)
-    return scene.touches(grid.centres_of(cells), grid.centres_of(after))
-
-
 def _check_finite(name: str, *rows: tuple[float, ...]) -> None:
     if not all(isfinite(number) for row in rows for number in row):
         raise BadSettings(f"{name} has a number that is not finite.")
 
 
-def _lists(value: Any) -> Any:
+def plain_json(value: Any) -> Any:
+    """Return a value as plain JSON, of which equal values have equal digests.
+
+    Args:
+        value: Dicts, lists and tuples of texts and numbers.
+    """
     if isinstance(value, dict):
-        return {name: _lists(part) for name, part in value.items()}
+        return {name: plain_json(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_lists(part) for part in value]
+        return [plain_json(part) for part in value]
     return float(value) if isinstance(value, int) else value  # so that 5 and 5.0 have the same digest
 
 
@@ -499,140 +344,26 @@ def _crosses(a: Floats, b: Floats, low: Floats, high: Floats) -> Flags:
     return np.asarray(~(np.maximum(enters, 0.0) > np.minimum(leaves, 1.0)))
 
 
-def _between_segments_mm(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
-    """Return the distance between lines from a to b, (..., 3), and the line from c to d, (3,).
+def segments_apart(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
+    """Return the distances of segments p + s u from segments q + t v, with s and t in 0..1.
 
-    The nearest points are inside both, or one is an end.
-    """
-    u, v, w = b - a, d - c, a - c
-    uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
-    uw, vw = (u * w).sum(-1), (w * v).sum(-1)
-    det = uu * vv - uv * uv
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        s, t = (uv * vw - vv * uw) / det, (uu * vw - uv * uw) / det
-    inside = (det > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-    s, t = np.where(inside, s, 0.0), np.where(inside, t, 0.0)
-    middle = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
-    ends = [_to_segment(a, c, d), _to_segment(b, c, d), _to_segment(c, a, b), _to_segment(d, a, b)]
-    return np.asarray(np.minimum(np.where(inside, middle, np.inf), np.min(np.broadcast_arrays(*ends), axis=0)))
-
-
-def _to_segment(point: Floats, a: Floats, b: Floats) -> Floats:
-    """Return the distance of points from lines from a to b; shapes broadcast to (..., 3)."""
-    way = b - a
-    length = (way * way).sum(-1)
-    share = ((point - a) * way).sum(-1) / np.where(length > 0, length, 1.0)
-    return np.asarray(np.linalg.norm(point - a - share.clip(0, 1)[..., None] * way, axis=-1))
-
-
-ROUNDING = 1e-9  # steps; points this near a line of the map count to both of its sides
-
-
-def tissue_of_mesh(
-    points_mm: ArrayLike, triangles: ArrayLike, normal: Point, *, step_mm: float = 1.0, beyond_mm: float | None = None
-) -> Tissue:
-    """Return the height map of a mesh of triangles.
-
-    Only what is visible from above counts: below its highest place along the normal all is tissue. With slopes of at
-    most L the map is at most 2 sqrt(2) L step_mm too high.
+    The least distance is between the lines if they are nearest within both segments, and otherwise at an end of one of
+    them: the s that is best for the lines is brought within the segment, then the t that is best for it, then s again.
+    Where the segments are nearly parallel this is exact too, because every s is then nearly as good. NaN stays NaN.
 
     Args:
-        points_mm: Points of the mesh in the frame of the scene, (n, 3).
-        triangles: Indices of the three points of each triangle, in any order, (m, 3).
-        normal: Direction out of the tissue; any length.
-        step_mm: Distance of the map's points; half of the smallest shape that matters, or less.
-        beyond_mm: Height of the tissue along the normal where the map has a point and the mesh has nothing, measured
-            from the origin of the frame; None refuses such a mesh. Holes between the map's points are not seen.
+        p: Beginnings of the first segments, shape (..., 3).
+        u: From their beginnings to their ends, same unit, shape (..., 3).
+        q: Beginnings of the other segments, same frame, shape (..., 3).
+        v: From their beginnings to their ends, shape (..., 3).
 
-    Raises:
-        BadSettings: Arrays have other shapes or contain numbers that are not finite or indices of no point; the map
-            would have too many points or none; or the mesh has a hole.
+    Returns:
+        Distances of the axes in the same unit, shape (...,); shapes are broadcast.
     """
-    points, corners = np.asarray(points_mm, float), np.asarray(triangles)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise BadSettings("The points of a mesh must be finite, of shape (n, 3).", shape=str(points.shape))
-    if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners) or corners.dtype.kind not in "iu":
-        raise BadSettings("The triangles of a mesh must be integers of shape (m, 3).", shape=str(corners.shape))
-    if not (corners.min() >= 0 and corners.max() < len(points)):
-        raise BadSettings(f"A triangle of a mesh names a point that is not among its {len(points)}.")
-    if not (np.isfinite(step_mm) and step_mm >= LEAST_STEP_MM):
-        raise BadSettings(f"step_mm of a height map must be {LEAST_STEP_MM:g} or more.", step_mm=step_mm)
-    plane = Tissue.plane((0.0, 0.0, 0.0), normal)
-    up, along = unit(np.array([normal, plane.along]))
-    axes = np.stack([along, np.cross(up, along)])
-    places = np.column_stack([product(points, axes.T) / step_mm, product(points, up)])[
-        corners
-    ]  # (m, 3, 3): steps, steps, mm
-    flat = places.reshape(-1, 3)
-    first = np.ceil(flat[:, :2].min(axis=0) - ROUNDING)
-    shape = np.floor(flat[:, :2].max(axis=0) + ROUNDING) - first + 1
-    if not shape.min() >= 1:
-        raise BadSettings("The mesh is smaller than step_mm; use a smaller step_mm.", step_mm=step_mm)
-    if not shape.prod() <= MOST_HEIGHTS:
-        raise BadSettings(
-            f"The height map of this mesh would have {shape.prod():.0f} points, and {MOST_HEIGHTS} are the most; use a "
-            "larger step_mm, or the part of the mesh that is near the path.",
-            step_mm=step_mm,
-        )
-    places[..., :2] -= first
-    heights = np.full(shape.astype(int), -np.inf)
-    inside = _inside(places, heights.shape)
-    covered = np.zeros(heights.shape, bool)
-    covered[tuple(inside[:, :2].astype(int).T)] = True
-    for some in (places.reshape(-1, 3), _crossings(places, 0), _crossings(places, 1), inside):
-        _raise_around(heights, some)
-    if not covered.all():
-        if beyond_mm is None:
-            missing = int((~covered).sum())
-            raise BadSettings(
-                f"The mesh covers {covered.size - missing} of the {covered.size} points of its height map. Cut a "
-                "rectangle out of it, or state beyond_mm, the height of the tissue where the mesh has nothing.",
-                missing=missing,
-            )
-        heights = np.where(covered, heights, np.maximum(heights, beyond_mm))
-    x, y, z = product(first * step_mm, axes).tolist()
-    rows = tuple(tuple(row) for row in heights.tolist())
-    return Tissue((x, y, z), normal, plane.along, step_mm, rows)
-
-
-def _inside(places: Floats, shape: tuple[int, ...]) -> Floats:
-    """Return the points of the map that are below or above a triangle, with its height there, (n, 3)."""
-    found = [np.empty((0, 3))]
-    for (a, b, c), low, high in zip(places, places.min(axis=1), places.max(axis=1), strict=True):
-        (u, v), w = (b - a)[:2], (c - a)[:2]
-        twice_area = u * w[1] - v * w[0]
-        if abs(twice_area) < ROUNDING:
-            continue  # upright: its edges have its highest places
-        rows, columns = (
-            np.arange(max(np.ceil(low[k] - ROUNDING), 0), min(np.floor(high[k] + ROUNDING), shape[k] - 1) + 1)
-            for k in (0, 1)
-        )
-        at = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
-        x, y = (at - a[:2]).T
-        to_b, to_c = (x * w[1] - y * w[0]) / twice_area, (y * u - x * v) / twice_area
-        held = (to_b >= -ROUNDING) & (to_c >= -ROUNDING) & (to_b + to_c <= 1 + ROUNDING)
-        rises = a[2] + to_b * (b - a)[2] + to_c * (c - a)[2]
-        found.append(np.column_stack([at, rises])[held])
-    return np.concatenate(found)
-
-
-def _crossings(places: Floats, axis: int) -> Floats:
-    """Return the points where edges cross the map's lines at whole steps along an axis, (n, 3)."""
-    a, b = (np.concatenate([places[:, k] for k in order]) for order in ((0, 1, 2), (1, 2, 0)))
-    low, high = np.ceil(np.minimum(a, b)[:, axis]), np.floor(np.maximum(a, b)[:, axis])
-    counts: Ints = np.where(a[:, axis] == b[:, axis], 0, np.maximum(high - low + 1, 0)).astype(np.int64)
-    edge = np.repeat(np.arange(len(a)), counts)
-    line = low[edge] + np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
-    share = (line - a[edge, axis]) / (b[edge, axis] - a[edge, axis])
-    return np.asarray(a[edge] + share[:, None] * (b[edge] - a[edge]))
-
-
-def _raise_around(heights: Floats, places: Floats) -> None:
-    """Raise the map's points within one step of each place, along each axis, to its height."""
-    nearest = np.ceil(places[:, :2] - 1 - ROUNDING).astype(np.int64)
-    for row in range(3):
-        for column in range(3):
-            at = nearest + np.array([row, column])
-            near = (at <= places[:, :2] + 1 + ROUNDING) & (at >= 0) & (at < heights.shape)
-            known = near.all(axis=1)
-            np.maximum.at(heights, tuple(at[known].T), places[known, 2])
+    r = p - q
+    uu, vv, uv, ur, vr = ((a * b).sum(axis=-1) for a, b in ((u, u), (v, v), (u, v), (u, r), (v, r)))
+    uu, vv = np.maximum(uu, 1e-12), np.maximum(vv, 1e-12)  # an axis without length is a point
+    s = np.clip((uv * vr - ur * vv) / np.maximum(uu * vv - uv * uv, 1e-12 * uu * vv), 0.0, 1.0)
+    t = np.clip((uv * s + vr) / vv, 0.0, 1.0)
+    s = np.clip((uv * t - ur) / uu, 0.0, 1.0)
+    return np.asarray(np.sqrt(np.square(r + s[..., None] * u - t[..., None] * v).sum(axis=-1)))

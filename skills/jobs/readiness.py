@@ -17,18 +17,15 @@ from sqlalchemy import select, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
-from skills.comparison._kernels import warp_pairs_compiled
-from skills.compiled import check_kept, kept_in, make_ready
+from skills.compiled import cache_folders, check_cache_folder, make_ready
 from skills.db import now
 from skills.db.models import SutureType
 from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import Executor
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
-from skills.formats.mcap._kernels import follow_compiled
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
-from skills.learning._kernels import warp_compiled
 from skills.learning.certificate import certify
 from skills.learning.evaluation import dtw, measure
 from skills.learning.policy import learn_tabular, rollout_from
@@ -160,13 +157,12 @@ def warm_up(work: Callable[[], object]) -> Thread:
         The thread.
 
     Raises:
-        BadSettings: Machine code would be loaded from a folder that other users can write to; see `check_kept`.
+        BadSettings: Machine code would be loaded from a folder that other users can write to; see `check_cache_folder`.
     """
-    folder = kept_in(warp_compiled)
-    for each in {folder, kept_in(follow_compiled), kept_in(warp_pairs_compiled)}:
-        check_kept(each)
+    for folder in cache_folders():
+        check_cache_folder(folder)
     # Not a daemon thread: the interpreter's shutdown must not kill it while it compiles.
-    warming = Thread(target=make_ready, args=(work, folder), name="warm-up")
+    warming = Thread(target=make_ready, args=(work,), name="warm-up")
     warming.start()
     return warming
 

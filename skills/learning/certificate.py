@@ -14,25 +14,16 @@ from dataclasses import asdict, dataclass
 from math import inf, prod
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skills.arrays import Bytes, Flags, Floats, Ints, frozen
+from skills.arrays import Bytes, Flags, Floats, Ints, freeze
 from skills.errors import BadSettings
 from skills.fields import Count, schema
 from skills.gridworld.domain import FINISHED
 from skills.gridworld.reward import sparse_reward
-from skills.learning import _kernels
-from skills.learning.dynamic_programming import (
-    FAINT,
-    TIE,
-    Mdp,
-    action_values,
-    exact_q,
-    exact_values,
-    log_losses,
-    off_rule,
-)
+from skills.gridworld.slip import slip_model
+from skills.learning.dynamic_programming import FAINT, Mdp, action_values, exact_q, exact_values, log_losses
 from skills.learning.policy import Policy
+from skills.learning.ties import TIE, off_rule
 
 NOISE = 1e-12  # of the cost of touching: values that nearly cancel are exact to less
 FAINTEST = 100  # times that noise: a smaller value is not compared
@@ -51,18 +42,16 @@ class Coverage:
         touching: In a scene, the probability that it touches the scene; None without a scene.
     """
 
-    reaches: NDArray[np.bool_]
-    joins_nearest: NDArray[np.bool_]
+    reaches: Flags
+    joins_nearest: Flags
     share: Floats
     finishing: Floats | None = None
     touching: Floats | None = None
 
     def __post_init__(self) -> None:
-        for name in ("reaches", "joins_nearest"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.bool_, (None,), name))
-        for name in ("share", "finishing", "touching"):
-            if (given := getattr(self, name)) is not None:
-                object.__setattr__(self, name, frozen(given, np.float64, self.reaches.shape, name))
+        count = len(self.reaches)
+        freeze(self, np.bool_, reaches=(count,), joins_nearest=(count,))
+        freeze(self, share=(count,), finishing=(count,), touching=(count,))
 
 
 @dataclass(frozen=True)
@@ -316,13 +305,14 @@ def mdp_of(policy: Policy) -> Mdp:
         The process, with the discount and the slip of the policy's learner, and the scene that it was learnt in.
     """
     learner = policy.learner
-    return Mdp(policy.domain, sparse_reward(policy.path, policy.levels), learner.gamma, learner.slip, policy.hazards)
+    reward = sparse_reward(policy.path, policy.levels)
+    return Mdp(policy.domain, reward, learner.gamma, slip_model(learner.slip), policy.hazards)
 
 
 def _achieved(policy: Policy) -> tuple[Floats, Floats]:
     """Return the value of each row's greedy action with optimal moves after it, and that of the best, both (rows,)."""
     mdp = mdp_of(policy)
-    if mdp.slip > 0:
+    if mdp.slip.probability > 0:
         q = exact_q(mdp)
         return q[np.arange(len(q)), policy.greedy.astype(np.int64).clip(0)], q.max(axis=1)
     best = exact_values(mdp)
@@ -336,7 +326,7 @@ def _off_rule(policy: Policy, values: Floats) -> int | None:
     return off_rule(mdp_of(policy), values, policy.greedy.astype(np.int64), policy.moves, policy.ties)
 
 
-def finishes(policy: Policy) -> NDArray[np.bool_]:
+def finishes(policy: Policy) -> Flags:
     """Return for every row whether the walk from it finishes.
 
     Args:
@@ -349,7 +339,7 @@ def finishes(policy: Policy) -> NDArray[np.bool_]:
     return _along(policy, done) > 0
 
 
-def shares_of(policy: Policy, finishing: NDArray[np.bool_]) -> Floats:
+def shares_of(policy: Policy, finishing: Flags) -> Floats:
     """Return for every state as a start the share of the demonstration that the policy follows.
 
     The share is the number of moves with which both the walk from the start and the demonstration end, over all moves
@@ -374,7 +364,7 @@ def shares_of(policy: Policy, finishing: NDArray[np.bool_]) -> Floats:
     return np.asarray(np.where(rows >= 0, followed[rows], 0) / last)
 
 
-def _along(policy: Policy, counted: NDArray[np.bool_]) -> Ints:
+def _along(policy: Policy, counted: Flags) -> Ints:
     """Count the marked rows along the walk from every row, itself included, (rows,).
 
     The walks of all rows are computed at once, by doubling their length. For a walk that goes in circles the count is
@@ -402,14 +392,20 @@ def least_gamma(policy: Policy) -> float | None:
     Returns:
         The gamma; None if the bound that slips leave says nothing about any below 1.
     """
-    path, slip = policy.path, policy.learner.slip
-    moves = np.full(path.grid.n_states, path.grid.n_states)
-    moves[policy.domain.may_meet] = 0
-    _kernels.spread_distances_compiled(moves.reshape(path.grid.shape))
-    # A move multiplies a value by gamma (1 - slip) or more, and the worth of the path is at least `visited`.
-    least, longest = FAINT / policy.levels.visited, max(1, int(moves.max()))
-    enough = (one / 100 for one in range(1, 100) if prod([one / 100 * (1 - slip)] * longest) >= least)
+    intended = slip_model(policy.learner.slip).intended
+    # A move multiplies a value by gamma times the probability that it does not slip, or more, and the worth of the path
+    # is at least `visited`.
+    least, longest = FAINT / policy.levels.visited, max(1, int(_fewest_moves(policy).max()))
+    enough = (one / 100 for one in range(1, 100) if prod([one / 100 * intended] * longest) >= least)
     return next(enough, None)
+
+
+def _fewest_moves(policy: Policy) -> Ints:
+    """Return the fewest moves (Chebyshev) from each state to one at which an unjoined pass meets the path."""
+    from scipy.ndimage import distance_transform_cdt  # here, because it is slow to import
+
+    away = ~policy.domain.may_meet.reshape(policy.path.grid.shape)
+    return np.asarray(distance_transform_cdt(away, "chessboard").ravel(), np.int64)
 
 
 def coverage(policy: Policy) -> Coverage:
@@ -425,12 +421,12 @@ def coverage(policy: Policy) -> Coverage:
     return Coverage(_reaches(policy, finishing), _joins_nearest(policy), shares_of(policy, finishing))
 
 
-def _reaches(policy: Policy, finishing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _reaches(policy: Policy, finishing: Flags) -> Flags:
     rows = policy.domain.start_rows
     return np.asarray((rows < 0) | finishing[rows])
 
 
-def _joins_nearest(policy: Policy) -> NDArray[np.bool_]:
+def _joins_nearest(policy: Policy) -> Flags:
     """Return for every state whether the walk from it meets the path in the fewest moves and then follows it.
 
     It meets the path at the waypoints at which its joining rule lets it join.
@@ -439,8 +435,7 @@ def _joins_nearest(policy: Policy) -> NDArray[np.bool_]:
     states = np.arange(path.grid.n_states)
     stepped = np.where(policy.greedy[: len(states)] >= 0, policy.moves.state[: len(states)], states)
     on_path = policy.domain.may_meet
-    fewest = np.where(on_path, 0, len(states))
-    _kernels.spread_distances_compiled(fewest.reshape(path.grid.shape))
+    fewest = _fewest_moves(policy)
     at, moved = states.copy(), np.zeros(len(states), np.int64)
     for _ in range(int(fewest.max())):
         walking = ~on_path[at]
@@ -450,7 +445,7 @@ def _joins_nearest(policy: Policy) -> NDArray[np.bool_]:
     return np.asarray(on_path[at] & (moved == fewest) & follows)
 
 
-def _follows(policy: Policy) -> NDArray[np.bool_]:
+def _follows(policy: Policy) -> Flags:
     """Return for every state of the path whether the policy follows the rest of it from the first visit on."""
     domain, path = policy.domain, policy.path
     index = np.arange(len(path.states) - 1)

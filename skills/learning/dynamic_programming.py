@@ -1,4 +1,4 @@
-"""Exact values by dynamic programming, value iteration as a learner, and the rule among equally good actions.
+"""Exact values by dynamic programming, and value iteration as a learner.
 
 The exact value of every row of a domain, and of every action in it, follows from the rewards without learning.
 
@@ -7,8 +7,7 @@ waypoint (at least 1: staying in its cell enters it), V = gamma^(d-1) A_p, where
 waypoint, and A of the last phase is the goal's reward. In phase 0, and in the paper's cell state, the values are the
 fixed point of value iteration over the grid.
 
-A move *slips* with a given probability: then one of the 27 moves is made instead of it, each with equal probability;
-off the grid the arm stays. In that case all values are the fixed point of value iteration over the whole domain.
+If moves slip (`skills.gridworld.slip`), all values are the fixed point of value iteration over the whole domain.
 
 With gamma 0.1 a state 300 moves from the path has a value below 10^-300, where floating-point numbers lose digits, and
 soon all. Such *faint* values are compared by their logarithms (`log_losses`): without slips as integers, in units of
@@ -19,46 +18,23 @@ the arm. The paper tried value iteration first, in its *cell* state, and gave it
 `skills.learning.max_ent_irl` explains one reason for the failure there, a path that crosses itself is another). In the
 phase state it finds the same policy as Q-learning, without exploration: it knows the result of each move, which
 Q-learning has to find out.
-
-Among equally good actions the rule takes that of the shortest way, then the shallowest, then the earliest to join:
-
-    Domain, Q values --choose--> the action of each row
-    Domain, exact values, actions --off_rule--> the number of rows whose action is not the one of the rule
-
-Four of five rows have several best actions, because the value of a move depends on the number of moves alone: a move
-along a diagonal costs as much as one along an axis. The paper takes any of them. The rule, ours, compares *approaches*:
-the walks from a row, by best actions only, to the first waypoint that they enter, which is the joining point in phase 0
-and the next waypoint later. It selects the action
-
-    1. whose approach is the shortest, through the centres of its cells;
-    2. of these, whose approach has the smallest greatest depth, in the cells after the first, which all have in common;
-    3. of these, whose approach joins the path earliest;
-    4. of these, with the lowest index.
-
-An approach continues by the rule, so that the length L, the depth D and the joining point J of a row follow from those
-of the next one: L = step + L', D = max(depth', D'), J = J'. Best actions lead to larger values, so there are no loops.
-If no walk of best actions enters a waypoint, as in values that were sampled too rarely, the lowest index counts.
-
-All three are compared as integers, so that no rounding decides: lengths in 2^-32 of a cell, in which the sums of 1,
-sqrt(2) and sqrt(3) of any two approaches differ, and depths in nanometres.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from math import hypot, isfinite
-from typing import ClassVar, Literal, cast
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skills.arrays import Bytes, Flags, Floats, Ints
+from skills.compiled import compiled
 from skills.errors import BadSettings
-from skills.fields import Point, schema
-from skills.gridworld.domain import Domain, Moves, check_join_share
-from skills.gridworld.grid import MOVES, GridWorld, moves_between
+from skills.gridworld.domain import Domain, Moves
+from skills.gridworld.grid import MOVES, moves_between
+from skills.gridworld.hazards import STAY, Hazards
 from skills.gridworld.reward import RewardMap
-from skills.gridworld.scene import STAY, Hazards
-from skills.learning import _kernels
+from skills.gridworld.slip import SlipModel, slip_model
+from skills.learning.learner_state import PhaseState
 
 MAX_SWEEPS = 100_000
 NO_STATE = -1  # of the state at which an unjoined pass finishes, where there is none
@@ -78,20 +54,20 @@ class Mdp:
         domain: The states: phases and cells.
         reward: The rewards.
         gamma: The discount.
-        slip: The probability that a move slips.
+        slip: How moves slip.
         hazards: A scene on the path's grid, or None; a move that touches it ends the pass.
     """
 
     domain: Domain
     reward: RewardMap
     gamma: float
-    slip: float = 0.0
+    slip: SlipModel = field(default_factory=lambda: slip_model(0.0))
     hazards: Hazards | None = None
 
     @property
     def closed_form(self) -> bool:
         """Whether the values follow from distances: nothing slips, and nothing is in the way."""
-        return self.slip == 0 and self.hazards is None
+        return self.slip.probability == 0 and self.hazards is None
 
 
 def exact_values(mdp: Mdp) -> Floats:
@@ -146,7 +122,7 @@ def _phase_0_values(mdp: Mdp, values: Floats) -> Floats:
     stays = domain.joins == 0
     stays[domain.path.goal] &= not domain.finishes_unjoined
     best, shape = np.zeros(grid.n_states), np.array(grid.shape)
-    settled = _kernels.settle_compiled(
+    settled = settle(
         best,
         worth,
         rewards,
@@ -200,8 +176,7 @@ def _iterated_q(mdp: Mdp) -> Floats:
     for _ in range(MAX_SWEEPS):
         made = pays + mdp.gamma * np.append(values, 0.0)[after]
         # A slip off the grid stays at no cost: only an intended move off the grid is a fault of the policy.
-        anywhere = np.where(off_grid, made[STAY], made).mean(axis=0)
-        q = (1 - mdp.slip) * made + mdp.slip * anywhere
+        q = mdp.slip.expected(made, np.where(off_grid, made[STAY], made))
         q[:, nothing] = 0.0
         change, values = np.abs(q.max(axis=0) - values), q.max(axis=0)
         if (change <= SETTLED * np.abs(values) + floor).all():
@@ -261,7 +236,7 @@ def log_losses(mdp: Mdp, values: Floats, greedy: Bytes, moves: Moves) -> Floats:
         BadSettings: With slips the logarithms do not settle, because the grid is too long.
     """
     assert mdp.reward.levels.other == 0, "a negative value has no logarithm"
-    if mdp.slip > 0:
+    if mdp.slip.probability > 0:
         q = _slipping_logs(mdp, values)
         with np.errstate(invalid="ignore"):  # a finished row has no action
             return np.asarray(q.max(axis=0) - q[greedy.astype(np.int64).clip(0), np.arange(len(values))])
@@ -295,9 +270,7 @@ def _logs(mdp: Mdp, values: Floats) -> tuple[Ints, Ints]:
     given = np.zeros(grid.n_states, bool)
     given[on_path] = True
     of_phase_0 = best[: grid.n_states]
-    _kernels.spread_worth_compiled(
-        of_phase_0.reshape(grid.shape), entering.reshape(grid.shape), given.reshape(grid.shape), int(step)
-    )
+    spread_worth(of_phase_0.reshape(grid.shape), entering.reshape(grid.shape), given.reshape(grid.shape), int(step))
     return best, entering
 
 
@@ -311,8 +284,7 @@ def _slipping_logs(mdp: Mdp, values: Floats) -> Floats:
         for _ in range(MAX_SWEEPS):
             made = np.logaddexp(pays, np.log(mdp.gamma) + np.append(logs, -np.inf)[after])
             made[off_grid] = -np.inf  # it is worth at most gamma of what the row is
-            anywhere = np.logaddexp.reduce(np.where(off_grid, made[STAY], made)) - np.log(len(MOVES))
-            q = np.logaddexp(np.log1p(-mdp.slip) + made, np.log(mdp.slip) + anywhere)
+            q = mdp.slip.log_expected(made, np.where(off_grid, made[STAY], made))
             q[:, nothing] = -np.inf
             before, logs = logs, q.max(axis=0)
             if ((logs == before) | (np.abs(logs - before) <= LOG_SETTLED + SETTLED * np.abs(logs))).all():
@@ -332,7 +304,7 @@ def _pays(mdp: Mdp, moves: Moves) -> Floats:
 
 
 @dataclass(frozen=True)
-class ValueIteration:
+class ValueIteration(PhaseState):
     """Settings of value iteration in the phase state. The result does not depend on a seed.
 
     The paper does not state its gamma. Ours is that of `PhaseQLearning`: the nearest waypoint always has the highest
@@ -340,16 +312,11 @@ class ValueIteration:
     """
 
     kind: ClassVar[str] = "value-iteration"
-    phased: ClassVar[bool] = True
 
     gamma: float = 0.1
-    slip: float = 0.0  # probability that one of the 27 moves, drawn uniformly, replaces the intended one
-    join_share: float = 0.0  # the joining rule: least share of the demonstration that a start is led to follow
 
     def __post_init__(self) -> None:
-        check_join_share(self.join_share)
-        if not 0 <= self.slip < 1:
-            raise BadSettings("slip must lie in [0, 1).", slip=self.slip)
+        super().__post_init__()
         if not 0 < self.gamma < 1:
             raise BadSettings(
                 "gamma must lie in (0, 1): with 1 a later arrival is worth as much as an earlier one.", gamma=self.gamma
@@ -370,199 +337,104 @@ def iterate_values(reward: RewardMap, settings: ValueIteration) -> Floats:
         BadSettings: Value iteration does not settle.
     """
     domain = Domain(reward.path, settings.phased, settings.join_share)
-    return exact_q(Mdp(domain, reward, settings.gamma, settings.slip))
+    return exact_q(Mdp(domain, reward, settings.gamma, slip_model(settings.slip)))
 
 
-TIE = 1e-9  # relative; two actions closer than this are equally good (a Q value carries about 1e-15 of rounding)
-NM_PER_MM = 1e6
+# ---- compiled loops -------------------------------------------------------------------------------------------------
 
 
-@schema
-@dataclass(frozen=True)
-class ShortestWay:
-    """The rule among equally good actions: shortest way, then least depth, then earliest joining point, lowest index.
+@compiled
+def settle(
+    best: Any,
+    worth: Any,
+    rewards: Any,
+    stays: Any,
+    shape: Any,
+    goal: int,
+    off_grid: float,
+    gamma: float,
+    tolerance: float,
+    max_sweeps: int,
+) -> Any:
+    """Iterate values over the grid, forwards and backwards in turn, until no relative change is above the tolerance.
 
-    The way is the one to the first waypoint that is entered, and its depth is the greatest of its cells. Depth is not
-    compared if neither of its two measures is given.
+    Args:
+        best: The value of the best move in each state, shape (n_states,), float64, iterated in place.
+        worth: Reward and discounted value of entering each state, shape (n_states,), float64, updated.
+        rewards: The reward for entering each state, shape (n_states,), float64.
+        stays: Whether entering a state neither changes the phase nor finishes, shape (n_states,), bool.
+        shape: Number of cells along each axis, shape (3,), int64.
+        goal: The state that finishes, whose value is not iterated; -1 if there is none.
+        off_grid: The reward of a move off the grid.
+        gamma: Discount.
+        tolerance: Relative change up to which a value counts as unchanged.
+        max_sweeps: Most sweeps; forwards and backwards count as two.
 
-    Attributes:
-        depth_from_mm: The point whose distance is the depth: the remote centre, the origin of an arm's base frame.
-        depth_along: The direction in which depth increases, in the frame of the demonstration.
-        kind: The name of the rule.
+    Returns:
+        True if the values settled within `max_sweeps`.
     """
-
-    depth_from_mm: Point | None = None
-    depth_along: Point | None = None
-    kind: Literal["shortest-way"] = "shortest-way"
-
-    def __post_init__(self) -> None:
-        if self.depth_from_mm is not None and self.depth_along is not None:
-            raise BadSettings("Depth is a distance from a point or a coordinate along a direction, not both.")
-        for name in ("depth_from_mm", "depth_along"):
-            given = getattr(self, name)
-            if given is None:
+    nx, ny, nz = shape[0], shape[1], shape[2]
+    for number in range(max_sweeps):
+        changed = 0
+        for i in range(len(best)):
+            state = i if number % 2 == 0 else len(best) - 1 - i
+            if state == goal:
                 continue
-            if len(given) != 3 or not all(map(isfinite, given)):
-                raise BadSettings(f"{name} must be three finite numbers.")
-            object.__setattr__(self, name, tuple(map(float, given)))  # as read from JSON, it is a list
-        if self.depth_along is not None and not hypot(*self.depth_along) > 0:
-            raise BadSettings("depth_along must not be (0, 0, 0): give the direction in which depth increases.")
-
-    def depths_nm(self, grid: GridWorld) -> Ints:
-        """Return the depth of every cell's centre in whole nanometres, (n_states,); 0 if depth is not compared."""
-        # Along each axis, because the centres of all cells would take three times the memory.
-        axes = [o + grid.cell_mm * np.arange(n) for o, n in zip(grid.origin_mm, grid.shape, strict=True)]
-        if self.depth_from_mm is not None:
-            parts = [(axis - at) ** 2 for axis, at in zip(axes, self.depth_from_mm, strict=True)]
-        elif self.depth_along is not None:
-            length = hypot(*self.depth_along)
-            parts = [axis * (part / length) for axis, part in zip(axes, self.depth_along, strict=True)]
-        else:
-            return np.zeros(grid.n_states, np.int64)
-        depth = parts[0][:, None, None] + parts[1][:, None] + parts[2]
-        if self.depth_from_mm is not None:
-            depth = np.sqrt(depth)
-        return np.asarray(np.rint(depth.reshape(-1) * NM_PER_MM), np.int64)
-
-
-REMOTE_CENTRE = ShortestWay(depth_from_mm=(0.0, 0.0, 0.0))  # of a demonstration in the base frame of its arm
+            x = state // (ny * nz)
+            y = state // nz % ny
+            z = state % nz
+            top = -np.inf
+            if x == 0 or y == 0 or z == 0 or x == nx - 1 or y == ny - 1 or z == nz - 1:
+                top = off_grid + gamma * best[state]
+            for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                    for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                        there = worth[(to_x * ny + to_y) * nz + to_z]
+                        if there > top:
+                            top = there
+            if not abs(top - best[state]) <= tolerance * abs(top):
+                changed += 1
+            best[state] = top
+            if stays[state]:
+                worth[state] = rewards[state] + gamma * top
+        if changed == 0:
+            return True
+    return False
 
 
-def rule_in(frame: str, depth_along: Sequence[float] | None = None) -> ShortestWay:
-    """Return the rule for a demonstration in a frame.
+@compiled
+def spread_worth(best: Any, worth: Any, given: Any, step: int) -> None:
+    """Spread the worth of given cells over a grid, forwards and backwards in turn, until nothing changes.
 
-    In the base of an arm, depth is the distance from the remote centre. In another frame it is measured along the given
-    direction, and not compared without one.
+    Each move adds `step`, which is negative, so that every cell ends with the best way to a given cell; a way ends at
+    the first given cell that it enters. Integers, so that equally good ways are equal.
 
     Args:
-        frame: Name of the frame; that of an arm's base ends with "_base".
-        depth_along: The direction in which depth increases in that frame, three numbers; not used in an arm's base.
-
-    Raises:
-        BadSettings: The direction is not three finite numbers, or has the length 0.
+        best: The worth of the best move in each cell, at first less than any, shape (nx, ny, nz), int64; changed in
+            place.
+        worth: That of entering each cell, at first less than any but at the given cells, shape (nx, ny, nz), int64;
+            changed in place.
+        given: Cells whose worth is given and does not change, shape (nx, ny, nz), bool.
+        step: Change of the worth with each move, below 0.
     """
-    if frame.endswith("_base"):
-        return REMOTE_CENTRE
-    return ShortestWay(depth_along=None if depth_along is None else cast(Point, tuple(depth_along)))
-
-
-def choose(domain: Domain, q: Floats, rule: ShortestWay) -> Ints:
-    """Return the action of each row by the rule; meaningless in rows without one.
-
-    Args:
-        domain: The certified domain, in the phase state.
-        q: Q values, shape (rows, 27).
-        rule: The rule.
-
-    Returns:
-        Actions, 0 to 26, shape (rows,).
-    """
-    value, equal = np.empty(len(q)), np.empty(len(q), np.int32)
-    _kernels.find_equal_compiled(q, TIE, value, equal)
-    live = np.flatnonzero(domain.certified & ~domain.terminal)
-    action = np.zeros(len(q), np.int64)
-    ends, joined = _ends(domain)
-    depth = rule.depths_nm(domain.path.grid)[domain.state_of]
-    _kernels.choose_ways_compiled(
-        action,
-        np.where(ends, 0, _kernels.NEVER),
-        depth.copy(),
-        joined,
-        ends,
-        live[_falling(value[live])],  # best actions lead to larger values: after one pass all is decided
-        equal,
-        depth,
-        domain.phase_of,
-        domain.offset,
-        domain.size,
-    )
-    return action
-
-
-def off_rule(mdp: Mdp, values: Floats, actions: Ints, moves: Moves, rule: ShortestWay) -> int:
-    """Count the rows whose action is not the one that the rule selects of the exactly best ones.
-
-    The lengths, depths and joining points are those of the walks by the given actions. The rule holds everywhere if no
-    best action of any row has a better next row: Bellman's equations, whose solution is unique, because no step of a
-    walk has the length 0.
-
-    Args:
-        mdp: The decision process.
-        values: Its exact values, shape (rows,).
-        actions: The action of each row, shape (rows,); negative in rows without one.
-        moves: Their results, arrays of shape (rows,).
-        rule: The rule.
-
-    Returns:
-        The number of rows.
-    """
-    domain, levels, path = mdp.domain, mdp.reward.levels, mdp.domain.path
-    ends, joined = _ends(domain)
-    worth = levels.other + mdp.gamma * values  # reward and discounted value of entering each row from its phase
-    last = domain.phases - 1
-    goes_on = np.flatnonzero(ends & (joined < last))  # the waypoint joined is the one behind in the phase that follows
-    after = domain.rows_of(joined[goes_on] + 1, path.cells[joined[goes_on]])
-    worth[goes_on] = levels.visited + mdp.gamma * values[after]
-    worth[ends & (joined == last)] = levels.goal
-    return int(
-        _kernels.count_off_rule_compiled(
-            np.flatnonzero(domain.certified & ~domain.terminal),
-            actions,
-            worth,
-            # With slips the values of two actions differ by less than those of entering their rows.
-            TIE / (1 - mdp.slip) * np.abs(values),
-            *_walks(domain, actions, moves, rule),
-            ends,
-            domain.phase_of,
-            domain.offset,
-            domain.size,
-        )
-    )
-
-
-def _ends(domain: Domain) -> tuple[NDArray[np.bool_], Ints]:
-    """Return whether a way ends on entering each row from its phase, and the waypoint that it enters, (rows,) each."""
-    path, first = domain.path, domain.offset[1]
-    joined = domain.phase_of.copy()
-    joined[:first] = domain.joins - 1
-    if domain.finishes_unjoined:
-        joined[path.goal] = domain.phases - 1
-    ends = domain.state_of == path.states[domain.phase_of]
-    ends[:first] = joined[:first] >= 0
-    return ends, joined
-
-
-def _walks(domain: Domain, actions: Ints, moves: Moves, rule: ShortestWay) -> tuple[Ints, Ints, Ints]:
-    """Return the way left on entering each row by given actions: its length, greatest depth and waypoint, (rows,) each.
-
-    The walks from all rows are computed at once, by doubling their length.
-    """
-    ends, joined = _ends(domain)
-    none = domain.n_rows  # in place of the row after the last one of a way
-    depth = rule.depths_nm(domain.path.grid)
-    joins = (moves.row >= 0) & (domain.phase_of[moves.row] != domain.phase_of)
-    arrives = ends | ((actions >= 0) & (moves.finishes | moves.advances | joins))
-    after = np.append(np.where(arrives | (actions < 0) | (moves.row < 0), none, moves.row), none)
-    step = np.array(_kernels.STEPS)[np.abs(MOVES).sum(axis=1)][actions]
-    length = np.append(np.where(ends, 0, step), 0)
-    deepest = depth[domain.state_of]
-    deepest = np.append(np.where(ends, deepest, np.maximum(deepest, depth[moves.state])), np.iinfo(np.int64).min)
-    ahead = np.where(domain.phase_of > 0, domain.phase_of, domain.joins[moves.state] - 1)
-    ahead[(domain.phase_of == 0) & moves.finishes] = domain.phases - 1
-    joined = np.append(np.where(ends, joined, np.where(arrives, ahead, -1)), -1)
-    for _ in range(domain.n_rows.bit_length()):  # a walk without a loop has fewer moves than there are rows
-        if (after == none).all():
-            break
-        length, deepest = length + length[after], np.maximum(deepest, deepest[after])
-        joined = np.where(joined < 0, joined[after], joined)
-        after = after[after]
-    length[joined < 0] = _kernels.NEVER
-    return length[:-1], deepest[:-1], joined[:-1]
-
-
-def _falling(values: Floats) -> Ints:
-    """Return the order of values from the largest to the smallest, as far as their first 20 binary digits tell."""
-    bits = ~values.view(np.uint64)  # of positive numbers, whose bits are in the order of the numbers
-    # Integers of 16 bits, because they are sorted in a third of the time of the numbers.
-    upper, lower = ((bits >> np.uint64(digits)).astype(np.uint16) for digits in (48, 32))
-    return np.asarray(np.lexsort((lower, upper)), np.int64)
+    nx, ny, nz = best.shape
+    changed = True
+    while changed:
+        changed = False
+        for way in range(2):
+            for i in range(nx):
+                x = i if way == 0 else nx - 1 - i
+                for j in range(ny):
+                    y = j if way == 0 else ny - 1 - j
+                    for k in range(nz):
+                        z = k if way == 0 else nz - 1 - k
+                        top = best[x, y, z]
+                        for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                            for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                                for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                                    top = max(top, worth[to_x, to_y, to_z])
+                        if top > best[x, y, z]:
+                            best[x, y, z] = top
+                            changed = True
+                            if not given[x, y, z]:
+                                worth[x, y, z] = top + step

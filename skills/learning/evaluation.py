@@ -13,15 +13,16 @@ goal's cell or the paper's 100 steps are used up.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arrays import Floats, Ints, frozen, xyz
+from skills.compiled import compiled
 from skills.errors import EmptyPath
 from skills.fields import Count, Point, schema
 from skills.gridworld import paper
-from skills.learning import _kernels
 from skills.learning.networks import DDPG, TRPO, InSpace, Network, Space, asked_step
 from skills.learning.policy import Policy, Rollout
 
@@ -74,8 +75,21 @@ def _warped(path: Floats, reference: Floats) -> Ints:
     distance = np.abs(path[:, None, :] - reference[None, :, :]).sum(axis=-1)
     cost = np.full((len(path) + 1, len(reference) + 1), np.inf)
     cost[0, 0] = 0.0
-    _kernels.warp_compiled(distance, cost)
+    warp(distance, cost)
     return _walk_back(cost)
+
+
+@compiled
+def warp(distance: Any, cost: Any) -> None:
+    """Fill the table of accumulated costs of dynamic time warping.
+
+    Args:
+        distance: Distance of each pair of points, shape (T, R).
+        cost: Shape (T + 1, R + 1), infinite at the edges and 0 at [0, 0]; filled in place.
+    """
+    for i in range(distance.shape[0]):
+        for j in range(distance.shape[1]):
+            cost[i + 1, j + 1] = distance[i, j] + min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
 
 
 def _walk_back(cost: Floats) -> Ints:

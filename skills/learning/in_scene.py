@@ -18,18 +18,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze
 from skills.errors import BadSettings
 from skills.fields import Count, schema
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import MOVES
+from skills.gridworld.hazards import Hazards
 from skills.gridworld.reward import RewardMap
-from skills.gridworld.scene import Hazards
+from skills.gridworld.slip import SlipModel, slip_model
 from skills.learning.certificate import mdp_of, optimal_in_scene
 from skills.learning.dynamic_programming import MAX_SWEEPS, Mdp, ValueIteration, exact_q
 from skills.learning.policy import Learner, Policy, check_learnable
 from skills.learning.q_learning import PhaseQLearning, Training, learn_q
-from skills.learning.slip import start_all
 
 SETTLED_ODDS = 1e-13  # a probability that changes by less has settled
 
@@ -49,8 +49,7 @@ class SceneOdds:
     touches: Floats
 
     def __post_init__(self) -> None:
-        for name in ("finishes", "touches"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (None,), name))
+        freeze(self, finishes=(None,), touches=(None,))
 
 
 @schema
@@ -106,7 +105,13 @@ def learn_in_scene(
         q, training = learn_q(reward, learner, seed, hazards)
         return Policy(reward.path, reward.levels, learner, seed, training, q, surroundings=hazards.surroundings)
     q = exact_q(
-        Mdp(Domain(reward.path, learner.phased, learner.join_share), reward, learner.gamma, learner.slip, hazards)
+        Mdp(
+            Domain(reward.path, learner.phased, learner.join_share),
+            reward,
+            learner.gamma,
+            slip_model(learner.slip),
+            hazards,
+        )
     )
     training = Training(steps=0, updates=0, episodes=0, finished=0, out_of_steps=0, out_of_time=0, settled=True)
     return Policy(reward.path, reward.levels, learner, seed, training, q, surroundings=hazards.surroundings)
@@ -161,16 +166,16 @@ def certify_in_scene(policy: Policy, hazards: Hazards) -> tuple[SceneCertificate
     return certificate, odds
 
 
-def odds_in_scene(policy: Policy, hazards: Hazards, slip: float) -> SceneOdds:
+def odds_in_scene(policy: Policy, hazards: Hazards, slip: SlipModel) -> SceneOdds:
     """Compute exactly the probabilities that a policy finishes, and that it touches, from every start.
 
     Its rows, finishing, touching and stopping are an absorbing Markov chain. No random numbers are used, so this is a
-    second method for `skills.learning.slip.walk`.
+    second method for `skills.learning.slip_runs.walk`.
 
     Args:
         policy: The policy, in the phase state.
         hazards: The scene on its grid.
-        slip: Probability of a slip, 0 to 1.
+        slip: How moves slip.
 
     Returns:
         The odds of every state as a start.
@@ -190,14 +195,14 @@ def odds_in_scene(policy: Policy, hazards: Hazards, slip: float) -> SceneOdds:
         odds = np.zeros(len(rows))
         for _ in range(MAX_SWEEPS):
             each = ends + np.append(odds, 0.0)[after]
-            before, odds = odds, (1 - slip) * each[intended, rows] + slip * each.mean(axis=0)
+            before, odds = odds, slip.expected(each[intended, rows], each)
             if np.abs(odds - before).max() <= SETTLED_ODDS:
                 break
         else:
-            raise BadSettings("The probabilities of finishing and touching do not settle.", slip=slip)
+            raise BadSettings("The probabilities of finishing and touching do not settle.", slip=slip.probability)
         found.append(odds)
     states = np.arange(grid.n_states)
-    phases, over = start_all(domain, states)
+    phases, over = domain.start(states)
     at = domain.rows_of(phases, grid.cells_of(states))
     forbidden = hazards.forbidden
     return SceneOdds(

@@ -24,24 +24,26 @@ reached from everywhere (a test shows it), by cutting nearly every corner.
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from skills.arithmetic import exp
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze
+from skills.compiled import compiled
 from skills.errors import BadSettings
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap
-from skills.learning._kernels import sum_around_compiled
 from skills.learning.dynamic_programming import Mdp, exact_q
+from skills.learning.learner_state import CellState
 
+HALVES = tuple(0.5**power for power in range(64))  # a part of a sum that is smaller does not change it
 MAX_NUMBERS = 2**24  # ours: moves x cells; B_t for all t takes 192 MiB then, and an iteration some seconds
 
 
 @dataclass(frozen=True)
-class MaxEntIRL:
+class MaxEntIRL(CellState):
     """Settings of maximum-entropy IRL, and of value iteration on the recovered reward; the paper states none of them.
 
     After 200 iterations the likelihood of the paper's demonstration is within 0.004 nat per move of that after 600.
@@ -49,9 +51,6 @@ class MaxEntIRL:
     """
 
     kind: ClassVar[str] = "max-ent-irl"
-    phased: ClassVar[bool] = False
-    slip: ClassVar[float] = 0.0
-    join_share: ClassVar[float] = 0.0
 
     iterations: int = 200
     learning_rate: float = 0.1  # of Adam
@@ -85,7 +84,7 @@ class RecoveredReward:
     visit_error: tuple[float, float]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rewards", frozen(self.rewards, np.float64, (None,), "rewards"))
+        freeze(self, rewards=(None,))
 
 
 def recover_reward(path: GridPath, settings: MaxEntIRL) -> RecoveredReward:
@@ -137,17 +136,52 @@ def soft_visits(path: GridPath, rewards: Floats) -> tuple[float, Floats]:
     backward, powers = np.zeros((moves + 1, *shape)), np.zeros((moves + 1, *shape), np.int32)
     backward[moves].flat[path.goal] = 1.0
     for t in range(moves - 1, -1, -1):
-        sum_around_compiled(factor * backward[t + 1], twos + powers[t + 1], backward[t], powers[t])
+        sum_around(factor * backward[t + 1], twos + powers[t + 1], backward[t], powers[t])
     z, z_power = backward[0].flat[path.start], powers[0].flat[path.start]
     forward, power, visits = np.zeros(shape), np.zeros(shape, np.int32), np.zeros(shape)
     forward.flat[path.start] = 1.0
     for t in range(1, moves + 1):
         after, after_power = np.empty(shape), np.empty(shape, np.int32)
-        sum_around_compiled(forward, power, after, after_power)
+        sum_around(forward, power, after, after_power)
         forward, power = factor * after, twos + after_power
         visits += np.ldexp(forward * backward[t] / z, power + powers[t] - z_power)
     log_z = float(np.log(z) + z_power * np.log(2.0))  # reported alone: no learnt number depends on it
     return (log_z - float(rewards[path.states[1:]].sum())) / moves, visits.reshape(-1)
+
+
+@compiled
+def sum_around(numbers: Any, powers: Any, total: Any, total_powers: Any) -> None:
+    """Add up each cell of a grid and its neighbours, at most 27 numbers, each times a power of two.
+
+    Args:
+        numbers: Not negative, shape (nx, ny, nz), float64; all but 0 of the same size within a few powers of two.
+        powers: The power of two of each, shape (nx, ny, nz), int32.
+        total: The sums, shape (nx, ny, nz), float64: 0, or from 1 to below 2.
+        total_powers: The power of two of each, shape (nx, ny, nz), int32; 0 for a sum of 0.
+    """
+    nx, ny, nz = numbers.shape
+    for x in range(nx):
+        for y in range(ny):
+            for z in range(nz):
+                added, top = 0.0, 0
+                for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                    for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                        for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                            number, power = numbers[to_x, to_y, to_z], powers[to_x, to_y, to_z]
+                            if number == 0.0:
+                                continue
+                            if added == 0.0 or power - top >= len(HALVES):
+                                added, top = number, power
+                            elif power > top:
+                                added, top = added * HALVES[power - top] + number, power
+                            elif top - power < len(HALVES):
+                                added += number * HALVES[top - power]
+                while added >= 2.0:
+                    added, top = 0.5 * added, top + 1
+                while 0.0 < added < 1.0:
+                    added, top = 2.0 * added, top - 1
+                total[x, y, z] = added
+                total_powers[x, y, z] = top
 
 
 class _Adam:

@@ -54,6 +54,7 @@ from skills.errors import BadInput, BadSettings
 from skills.gridworld import paper
 from skills.gridworld.grid import MOVES, GridPath
 from skills.gridworld.reward import RewardLevels, RewardMap
+from skills.learning.learner_state import CellState
 
 Layer = tuple[NDArray[np.float32], NDArray[np.float32]]  # weights, (outputs, inputs), and biases, (outputs,)
 DECIMALS = 6  # ours: a float32 has seven digits, and sums agree to six whatever the order of summation
@@ -222,7 +223,7 @@ FARTHEST = np.sqrt(12.0)
 
 
 @dataclass(frozen=True)
-class DQN:
+class DQN(CellState):
     """Settings of deep Q-learning on the grid.
 
     The behaviour is random until the end, since Q-learning is off-policy: episodes start anywhere, and with a random
@@ -230,9 +231,6 @@ class DQN:
     """
 
     kind: ClassVar[str] = "dqn"
-    phased: ClassVar[bool] = False
-    slip: ClassVar[float] = 0.0
-    join_share: ClassVar[float] = 0.0
 
     gamma: float = 0.8  # at 0.1, the table's, values a few cells off the path are too small for a network to resolve
     steps: int = 400_000  # in all environments together: about ten minutes on one core
@@ -252,7 +250,7 @@ class DQN:
 
 
 @dataclass(frozen=True)
-class DDPG:
+class DDPG(CellState):
     """Settings of the deep deterministic policy gradient in the continuous space.
 
     `discount` is the one of the training. The policy is certified like all others, against Algorithm 1's rewards with
@@ -260,9 +258,6 @@ class DDPG:
     """
 
     kind: ClassVar[str] = "ddpg"
-    phased: ClassVar[bool] = False
-    slip: ClassVar[float] = 0.0
-    join_share: ClassVar[float] = 0.0
     gamma: ClassVar[float] = 0.1
 
     discount: float = 0.98  # the end of a path of 28 states still counts for half; at 0.95 the shortcut wins
@@ -282,13 +277,10 @@ class DDPG:
 
 
 @dataclass(frozen=True)
-class TRPO:
+class TRPO(CellState):
     """Settings of trust-region policy optimisation in the continuous space; `discount` and `gamma` as for `DDPG`."""
 
     kind: ClassVar[str] = "trpo"
-    phased: ClassVar[bool] = False
-    slip: ClassVar[float] = 0.0
-    join_share: ClassVar[float] = 0.0
     gamma: ClassVar[float] = 0.1
 
     discount: float = 0.98

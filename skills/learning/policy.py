@@ -4,7 +4,7 @@
 
 `skills.deep.learn_policy` learns with all learners, `learn_tabular` with those that need no network. The *greedy*
 action of a row has the largest Q value. Of equally good ones the tabular learners of the phase state take the one of
-the shortest way (`skills.learning.dynamic_programming`); the others, whose values have not settled, the one with the
+the shortest way (`skills.learning.ties`); the others, whose values have not settled, the one with the
 lowest index.
 """
 
@@ -16,17 +16,18 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Bytes, Floats, Ints, frozen, xyz
+from skills.arrays import Bytes, Floats, Ints, freeze, frozen, xyz
 from skills.errors import BadSettings, OutsideGrid
 from skills.gridworld import paper
 from skills.gridworld.domain import FINISHED, OUTSIDE, Domain, Moves
 from skills.gridworld.grid import GridPath, refuse_metres
+from skills.gridworld.hazards import Hazards, Surroundings, hazards_of, touching
 from skills.gridworld.reward import RewardLevels, RewardMap
-from skills.gridworld.scene import Hazards, Surroundings, hazards_of, touching
-from skills.learning.dynamic_programming import REMOTE_CENTRE, ShortestWay, ValueIteration, choose, iterate_values
+from skills.learning.dynamic_programming import ValueIteration, iterate_values
 from skills.learning.max_ent_irl import MaxEntIRL, learn_from_recovered
 from skills.learning.networks import DDPG, DQN, TRPO, Network
 from skills.learning.q_learning import CellQLearning, PhaseQLearning, Training, learn_q
+from skills.learning.ties import REMOTE_CENTRE, ShortestWay, choose
 from skills.notebook import card
 
 Tabular = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL
@@ -212,7 +213,7 @@ class Policy:
             raise BadSettings("Only in the phase state a policy is learnt in a scene; leave `surroundings` out.")
         if self.ties is not None and not self.learner.phased:
             raise BadSettings("Only in the phase state a way ends where it joins the path; leave `ties` out.")
-        object.__setattr__(self, "q", frozen(self.q, np.float64, (self.domain.n_rows, paper.N_ACTIONS), "q"))
+        freeze(self, q=(self.domain.n_rows, paper.N_ACTIONS))
 
     @cached_property
     def domain(self) -> Domain:
@@ -361,8 +362,9 @@ def rollout_from(policy: Policy, state: int) -> Rollout:
         The visited states and phases, the start first.
     """
     domain, moves = policy.domain, policy.moves
-    phase, done = domain.start(state)
-    states, phases, seen = [state], [phase], set[int]()
+    phase, ends = domain.start(state)
+    done = bool(ends)
+    states, phases, seen = [state], [int(phase)], set[int]()
     row = -1 if done else int(domain.rows_of(phase, policy.path.grid.cells_of(state)))
     # Without `seen` a policy that goes round in circles would be followed for ever.
     while row >= 0 and row not in seen and policy.greedy[row] >= 0:
@@ -424,7 +426,8 @@ def next_step(policy: Policy, position_mm: ArrayLike, phase: int | None) -> Step
         phase = 0 if phase is None else phase
         return Step(phase, None, None, None, False, 0.0, _correction(policy, here, phase))
     # On a closed path the goal's cell finishes when it is entered, not when it is the start.
-    phase, done = domain.start(state) if phase is None else domain.enter(phase, state)
+    entered, finished = domain.start(state) if phase is None else domain.enter(phase, state)
+    phase, done = int(entered), bool(finished)
     on_path = state == policy.path.states[phase - 1] if phase > 0 else domain.may_meet[state]
     correction = None if done or on_path else _correction(policy, here, phase)
     row = None if done else policy.row(phase, state)
@@ -433,7 +436,7 @@ def next_step(policy: Policy, position_mm: ArrayLike, phase: int | None) -> Step
         return Step(phase, None, None, None, done, 0.0, correction)
     action = int(policy.greedy[row])
     after = int(policy.moves.state[row])
-    next_phase, _ = domain.enter(phase, after)
+    next_phase = int(domain.enter(phase, after)[0])
     confidence = float(policy.confidence[row])
     return Step(phase, action, xyz(grid.centres_mm(after)), next_phase, False, confidence, correction)
 

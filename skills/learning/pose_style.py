@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
 
 from skills.arithmetic import product
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze, frozen
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs
 from skills.demonstration.partner import PartnerMotion
@@ -80,17 +80,8 @@ class PosePath:
 
     def __post_init__(self) -> None:
         count = len(self.tip_mm)
-        shapes: dict[str, tuple[int, ...]] = {
-            "tip_mm": (count, 3),
-            "rotation_xyzw": (count, 4),
-            "elapsed_s": (count,),
-            "jaw_rad": (count,),
-            "spread_mm": (count,),
-            "spread_rad": (count,),
-        }
-        for name, shape in shapes.items():
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        freeze(self, tip_mm=(count, 3), rotation_xyzw=(count, 4), elapsed_s=(count,), jaw_rad=(count,))
+        freeze(self, spread_mm=(count,), spread_rad=(count,))
         if self.partner is not None and len(self.partner.tip_mm) != count:
             raise BadInput(f"The other arm has {len(self.partner.tip_mm)} poses, and the path {count}.")
 
@@ -120,15 +111,8 @@ class PoseStyle:
 
     def __post_init__(self) -> None:
         count = len(self.tip_mm)
-        shapes: dict[str, tuple[int, ...]] = {
-            "tip_mm": (count, PHASES, 3),
-            "rotation_xyzw": (count, PHASES, 4),
-            "duration_s": (count,),
-            "jaw_rad": (count, PHASES),
-        }
-        for name, shape in shapes.items():
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        freeze(self, tip_mm=(count, PHASES, 3), rotation_xyzw=(count, PHASES, 4))
+        freeze(self, duration_s=(count,), jaw_rad=(count, PHASES))
 
     def between(self, start_mm: ArrayLike, start_xyzw: ArrayLike, goal_mm: ArrayLike, goal_xyzw: ArrayLike) -> PosePath:
         """Return the style's motion from a start pose to a goal pose; it begins and ends in them exactly.

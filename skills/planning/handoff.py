@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import arctan2, cos, product, sin
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze, frozen
 from skills.errors import BadPlan, NoApproach
 from skills.kinematics import DEFAULT_INSTRUMENT, check_rotation, instrument_of, matrix_of, quaternion_of
 from skills.quaternions import unit
@@ -117,11 +117,7 @@ class OtherArm:
     jaw_rad: Floats | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "base_mm", frozen(self.base_mm, np.float64, (3,), "base_mm"))
-        object.__setattr__(self, "base_xyzw", frozen(self.base_xyzw, np.float64, (4,), "base_xyzw"))
-        object.__setattr__(self, "joints", frozen(self.joints, np.float64, (None, 6), "joints"))
-        if self.jaw_rad is not None:
-            object.__setattr__(self, "jaw_rad", frozen(self.jaw_rad, np.float64, (len(self.joints),), "jaw_rad"))
+        freeze(self, base_mm=(3,), base_xyzw=(4,), joints=(None, 6), jaw_rad=(len(self.joints),))
         matrix_of(self.base_xyzw[None])
 
 
@@ -236,8 +232,7 @@ class Realignment:
     sign: int
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rotation", frozen(self.rotation, np.float64, (3, 3), "rotation"))
-        object.__setattr__(self, "axis", frozen(self.axis, np.float64, (3,), "axis"))
+        freeze(self, rotation=(3, 3), axis=(3,))
 
 
 def realign(rotation: ArrayLike, approach_m: ArrayLike, toward: ArrayLike | None = None) -> Realignment:

@@ -23,7 +23,7 @@ from math import ceil, sqrt
 import numpy as np
 
 from skills.arithmetic import arccos
-from skills.arrays import Floats, Ints, frozen
+from skills.arrays import Floats, Ints, freeze
 from skills.errors import BadSpeed
 from skills.kinematics import angle_between
 from skills.planning.handoff import turn
@@ -170,8 +170,7 @@ class Pose:
     rotation: Floats
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (3,), "tip_mm"))
-        object.__setattr__(self, "rotation", frozen(self.rotation, np.float64, (3, 3), "rotation"))
+        freeze(self, tip_mm=(3,), rotation=(3, 3))
 
 
 Arms = tuple[Pose, ...]  # PSM_A, and PSM_M if it moves too

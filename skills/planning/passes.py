@@ -35,7 +35,7 @@ from math import pi
 import numpy as np
 
 from skills.arithmetic import product
-from skills.arrays import Bytes, Floats, Ints, frozen
+from skills.arrays import Bytes, Floats, Ints, freeze
 from skills.errors import BadPlan, NoMotion, Unreachable
 from skills.kinematics import JOINTS, ROLL, check_rotation, instrument_of, inverse, matrix_of
 from skills.planning.handoff import OtherArm, PsmM, hand_off
@@ -225,19 +225,12 @@ class PassPath:
         return np.asarray(matrix_of(self.hand.rotation_xyzw[-1:])[0])
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
-        object.__setattr__(self, "rotation", frozen(self.rotation, np.float64, (3, 3), "rotation"))
-        check_rotation(self.rotation[None])
-        points = self.tip_mm
-        if self.start_mm is not None:
-            object.__setattr__(self, "start_mm", frozen(self.start_mm, np.float64, (3,), "start_mm"))
-            points = np.append(points, self.start_mm[None], axis=0)
-        if (np.abs(points) > FAR_MM).any():
+        freeze(self, tip_mm=(None, 3), rotation=(3, 3), target_rotation=(3, 3), start_mm=(3,))
+        for rotation in (self.rotation, self.target_rotation):
+            if rotation is not None:
+                check_rotation(rotation[None])
+        if any((np.abs(points) > FAR_MM).any() for points in (self.tip_mm, self.start_mm) if points is not None):
             raise BadPlan("A point is more than ten metres away; give millimetres in the PSM base frame.")
-        if self.target_rotation is not None:
-            target = frozen(self.target_rotation, np.float64, (3, 3), "target_rotation")
-            check_rotation(target[None])
-            object.__setattr__(self, "target_rotation", target)
 
 
 @dataclass(frozen=True, eq=False)

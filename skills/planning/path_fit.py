@@ -53,7 +53,7 @@ from math import dist
 import numpy as np
 
 from skills.arithmetic import product
-from skills.arrays import Flags, Floats, Ints, frozen
+from skills.arrays import Flags, Floats, Ints, freeze
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
 from skills.errors import BadPlan
@@ -94,10 +94,9 @@ class SmoothedDemo:
     end_s: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
-        object.__setattr__(self, "seconds", frozen(self.seconds, np.float64, (len(self.tip_mm),), "seconds"))
-        object.__setattr__(self, "ends_mm", frozen(self.ends_mm, np.float64, (2, 3), "ends_mm"))
-        object.__setattr__(self, "waypoints", frozen(self.waypoints, np.int64, (len(self.tip_mm),), "waypoints"))
+        count = len(self.tip_mm)
+        freeze(self, tip_mm=(count, 3), seconds=(count,), ends_mm=(2, 3))
+        freeze(self, np.int64, waypoints=(count,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +116,8 @@ class FittedPath:
     places: Floats
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
-        object.__setattr__(self, "visits", frozen(self.visits, np.int64, (len(self.tip_mm),), "visits"))
-        object.__setattr__(self, "clock_s", frozen(self.clock_s, np.float64, (None,), "clock_s"))
-        object.__setattr__(self, "places", frozen(self.places, np.float64, (len(self.clock_s),), "places"))
+        freeze(self, tip_mm=(None, 3), clock_s=(None,), places=(len(self.clock_s),))
+        freeze(self, np.int64, visits=(len(self.tip_mm),))
 
 
 def trace(demo: Demo, path: GridPath) -> SmoothedDemo:
@@ -347,10 +344,7 @@ class Hand:
 
     def __post_init__(self) -> None:
         count = len(self.seconds)
-        shapes: dict[str, tuple[int, ...]] = {"seconds": (count,), "tip_mm": (count, 3), "jaw_rad": (count,)}
-        for name, shape in {**shapes, "rotation_xyzw": (count, 4)}.items():
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        freeze(self, seconds=(count,), tip_mm=(count, 3), rotation_xyzw=(count, 4), jaw_rad=(count,))
         if count < 2 or self.seconds[0] != 0 or (np.diff(self.seconds) <= 0).any():
             raise BadPlan("The times of a hand begin at 0 and increase; give at least two.")
         if self.rotation_xyzw is not None:

@@ -33,6 +33,7 @@ goes through the centres of its cells, as in the paper. All of this is ours.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import dist
 from typing import Literal
 
@@ -40,7 +41,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import product
-from skills.arrays import Floats, Ints, frozen
+from skills.arrays import Floats, Ints, freeze, frozen
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan, BadSpeed, OutsideGrid
 from skills.fields import Count, schema
@@ -60,7 +61,8 @@ from skills.notebook import card
 from skills.planning.handoff import PsmM, needle_tips_mm, realign
 from skills.planning.motion_laws import Pose, followed
 from skills.planning.passes import PassPath, Way, ways
-from skills.planning.path_fit import Hand, SmoothedDemo, ends_of, fit_to_demo, hand_along, moved, trace
+from skills.planning.path_fit import SmoothedDemo, ends_of, fit_to_demo, hand_along, moved, trace
+from skills.planning.trajectory import Trajectory, time_parametrise
 
 MAX_PASSES = 200
 RATE_HZ = (100.0, 200.0)  # of the plans that a robot's controller follows
@@ -88,43 +90,27 @@ class SuturePoint:
     rotation_xyzw: tuple[float, float, float, float] = UNTURNED
 
 
-@dataclass(frozen=True, eq=False)
-class Pass:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pass(PassPath):
     """One pass of a plan, in mm of the arm's frame.
 
+    Fitted, its path has about four points per cell, each in one of the states, in their order. Otherwise it has the
+    beginning, if that is not a centre, and the states' centres. It begins at the start, or where it enters the grid
+    world.
+
     Attributes:
+        start_mm: Start of the tip, shape (3,).
         point: The suture point.
-        start_mm: Start of the tip, shape (3,); if the path begins elsewhere, a transfer leads there.
         states: The states of the grid world that the pass goes through, shape (T,).
-        tip_mm: The tip's path to the suture point, from the start or from where it enters the grid world, shape (K, 3).
-            Fitted: about four points per cell, each in one of those states, in their order. Otherwise: the beginning,
-            if that is not a centre, and the states' centres.
-        rotation: The jaw's [n o a] at the start of A1, shape (3, 3); held, unless the hand turns it.
-        target_rotation: Target of the turn in A2, shape (3, 3), or None if PSM_M's approach is not known.
-        hand: Orientation, jaw and tempo of A1; None: the jaw held, at an even tempo.
-        taking: The recorded pose in which PSM_M takes the needle; None: that of the paper's A2.
     """
 
-    point: SuturePoint
     start_mm: Floats
+    point: SuturePoint
     states: Ints
-    tip_mm: Floats
-    rotation: Floats
-    target_rotation: Floats | None
-    hand: Hand | None = None
-    taking: Pose | None = None
 
     def __post_init__(self) -> None:
-        for name, dtype, shape in (
-            ("start_mm", np.float64, (3,)),
-            ("states", np.int64, (None,)),
-            ("tip_mm", np.float64, (None, 3)),
-            ("rotation", np.float64, (3, 3)),
-        ):
-            object.__setattr__(self, name, frozen(getattr(self, name), dtype, shape, name))
-        if self.target_rotation is not None:
-            target = frozen(self.target_rotation, np.float64, (3, 3), "target_rotation")
-            object.__setattr__(self, "target_rotation", target)
+        super().__post_init__()
+        freeze(self, np.int64, states=(None,))
 
 
 @schema
@@ -189,12 +175,19 @@ class SuturePlan:
         if not 0 <= self.tip_offset_mm <= MAX_TIP_OFFSET_MM:
             raise BadPlan(f"The tip's offset must be 0 to {MAX_TIP_OFFSET_MM:g} mm.", tip_offset_mm=self.tip_offset_mm)
 
-    @property
-    def pass_paths(self) -> tuple[PassPath, ...]:
-        """The passes as input for `time_parametrise`."""
-        return tuple(
-            PassPath(one.tip_mm, one.rotation, one.target_rotation, one.start_mm, one.hand, one.taking)
-            for one in self.passes
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The plan in time, for all who need it: planning, playback and export; computed once.
+
+        Raises:
+            BadSpeed, NoMotion, BadPlan, Unreachable: As for `time_parametrise`.
+        """
+        return time_parametrise(
+            self.passes,
+            speed_mm_s=self.speed_mm_s,
+            rate_hz=self.rate_hz,
+            instrument=self.instrument,
+            psm_m=self.psm_m,
         )
 
     def _repr_html_(self) -> str:
@@ -421,7 +414,14 @@ def _pass(
             held = matrix_of(hand.rotation_xyzw[:1])[0]
     if np.abs(path[0] - begin).max() > NEGLIGIBLE_MM:
         path = np.concatenate((begin[None], path))
-    one = Pass(point, start, followed.states, product(path - goal, turned.T) + place, held, None, hand)
+    one = Pass(
+        tip_mm=product(path - goal, turned.T) + place,
+        rotation=held,
+        start_mm=start,
+        hand=hand,
+        point=point,
+        states=followed.states,
+    )
     return _with_a2(one, plan, recorded, goal, turned)
 
 
@@ -430,7 +430,7 @@ def _with_a2(one: Pass, plan: SuturePlan, recorded: _Recorded | None, goal_mm: F
     psm_m = plan.psm_m
     if psm_m is None:
         return one
-    brought = PassPath(one.tip_mm, one.rotation, hand=one.hand).last_rotation
+    brought = one.last_rotation
     if plan.a2 == "paper":
         return replace(one, target_rotation=realign(brought, psm_m.approach).rotation)
     assert recorded is not None and recorded.last_rotation is not None
@@ -530,7 +530,7 @@ def driven_pass(policy: Policy, demo: Demo) -> DrivenPass:
     """
     plan = _at_its_own_place(policy, demo)
     (only,) = plan.passes
-    (way,) = ways(plan.pass_paths, None)
+    (way,) = ways(plan.passes, None)
     line, rotation = _driven(way, only.rotation)
     nearest, beyond = nearest_limit(line, rotation, demo.instrument)
     return DrivenPass(

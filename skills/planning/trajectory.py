@@ -31,16 +31,18 @@ the place where one pass ends and the next begins: time passes there, and nothin
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from math import ceil, isfinite, radians, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Bytes, Floats, Ints, frozen
+from skills.arithmetic import product
+from skills.arrays import Bytes, Floats, Ints, freeze
 from skills.errors import BadPlan, BadSpeed, NoMotion
 from skills.fields import Count, schema
-from skills.kinematics import DEFAULT_INSTRUMENT, angle_between, instrument_of, matrix_of, quaternion_of
+from skills.kinematics import DEFAULT_INSTRUMENT, angle_between, forward, instrument_of, matrix_of, quaternion_of
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, Jaws, OtherArm, PsmM
 from skills.planning.motion_laws import (
     A1,
@@ -66,6 +68,53 @@ _HEADROOM = 0.98  # each slow-down aims this far below the limits, so that a sec
 _ATTEMPTS = 20
 
 Paces = tuple[Pace, Pace, Pace]  # of each phase
+
+
+PSM_A, PSM_M = "PSM_A", "PSM_M"  # the names of the two arms: the one that hands over, and the one that takes
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedArm:
+    """One arm of a trajectory, with its base.
+
+    Attributes:
+        name: `PSM_A` or `PSM_M`.
+        instrument: Number of its instrument.
+        joints: Rows of `kinematics.JOINTS`, rad and mm, shape (T, 6).
+        jaw_rad: Angle of its jaw, shape (T,); None: not planned.
+        base: Rotation of its base in PSM_A's base frame, shape (3, 3).
+        base_mm: Its remote centre there, shape (3,).
+    """
+
+    name: str
+    instrument: str
+    joints: Floats
+    jaw_rad: Floats | None
+    base: Floats
+    base_mm: Floats
+
+    def poses(self, at: Ints | slice = slice(None)) -> Poses:
+        """Return the arm's poses at some samples in PSM_A's base frame, by the forward kinematics."""
+        tip_mm, rotation = forward(self.joints[at], self.instrument)
+        return Poses(product(tip_mm, self.base.T) + self.base_mm, product(self.base, rotation))
+
+
+@schema
+@dataclass(frozen=True, kw_only=True)
+class SampleMoment:
+    """A sample of a trajectory.
+
+    Attributes:
+        sample: The sample.
+        pass_index: Its pass.
+        phase: The name of its phase.
+        stamp_s: Its time.
+    """
+
+    sample: Count
+    pass_index: Count
+    phase: str
+    stamp_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +164,11 @@ class Trajectory:
         instrument_of(self.instrument)
         _check_rate(self.rate_hz)
         count = len(self.stamps_s)
-        for name, dtype, shape in (
-            ("stamps_s", np.float64, (count,)),
-            ("tip_mm", np.float64, (count, 3)),
-            ("rotation_xyzw", np.float64, (count, 4)),
-            ("joints", np.float64, (count, 6)),
-            ("pass_index", np.int64, (count,)),
-            ("phase", np.int8, (count,)),
-        ):
-            object.__setattr__(self, name, frozen(getattr(self, name), dtype, shape, name))
+        freeze(
+            self, stamps_s=(count,), tip_mm=(count, 3), rotation_xyzw=(count, 4), joints=(count, 6), jaw_rad=(count,)
+        )
+        freeze(self, np.int64, pass_index=(count,))
+        freeze(self, np.int8, phase=(count,))
         if not count:
             raise NoMotion("A trajectory needs at least one sample.")
         if not (np.diff(self.stamps_s) > 0).all() or not np.isin(np.diff(self.pass_index), (0, 1)).all():
@@ -135,8 +180,6 @@ class Trajectory:
             )
         if self.psm_m is not None and len(self.psm_m.joints) != count:
             raise BadPlan(f"PSM_M has {len(self.psm_m.joints)} samples and PSM_A has {count}; give equal numbers.")
-        if self.jaw_rad is not None:
-            object.__setattr__(self, "jaw_rad", frozen(self.jaw_rad, np.float64, (count,), "jaw_rad"))
 
     def __len__(self) -> int:
         """The number of samples."""
@@ -151,6 +194,24 @@ class Trajectory:
     def duration_s(self) -> float:
         """Seconds from the first sample to the last, pauses included."""
         return float(self.stamps_s[-1] - self.stamps_s[0])
+
+    @cached_property
+    def arms(self) -> tuple[PlannedArm, ...]:
+        """PSM_A, and PSM_M if it moves."""
+        psm_a = PlannedArm(PSM_A, self.instrument, self.joints, self.jaw_rad, np.eye(3), np.zeros(3))
+        m = self.psm_m
+        if m is None:
+            return (psm_a,)
+        return psm_a, PlannedArm(PSM_M, m.instrument, m.joints, m.jaw_rad, matrix_of(m.base_xyzw[None])[0], m.base_mm)
+
+    def moment(self, sample: int) -> SampleMoment:
+        """Return a sample with its pass, phase and time."""
+        return SampleMoment(
+            sample=int(sample),
+            pass_index=int(self.pass_index[sample]),
+            phase=PHASES[self.phase[sample]],
+            stamp_s=float(self.stamps_s[sample]),
+        )
 
     @property
     def last_samples(self) -> Ints:
@@ -533,10 +594,10 @@ def seams(trajectory: Trajectory) -> list[Seam]:
     after = before + 1
     rotation = matrix_of(trajectory.rotation_xyzw)
     turned = np.degrees(angle_between(rotation[before], rotation[after]))
-    moving = [(trajectory.joints, trajectory.instrument)]
-    if trajectory.psm_m is not None:
-        moving.append((trajectory.psm_m.joints, trajectory.psm_m.instrument))
-    leaps = [np.abs(q[after] - q[before]) / instrument_of(tool).speed * trajectory.rate_hz for q, tool in moving]
+    leaps = [
+        np.abs(arm.joints[after] - arm.joints[before]) / instrument_of(arm.instrument).speed * trajectory.rate_hz
+        for arm in trajectory.arms
+    ]
     return [
         Seam(
             after_pass=number,

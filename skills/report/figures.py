@@ -10,13 +10,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
+from skills.arithmetic import wilson
 from skills.arrays import Floats
 from skills.gridworld.grid import GridPath
-from skills.learning.slip import wilson
 from skills.report.numbers import LearntStyle, Numbers
 
 if TYPE_CHECKING:
-    from skills.schemas.given import DemoPath, Policy, Rollout
+    from skills.schemas.demos import DemoPath
+    from skills.schemas.policies import Policy, Rollout
 
 # a palette for colour-blind readers (Okabe, Ito)
 RECORDED, CELLS, ROLLOUT, GOAL = "#8a8f98", "#0072b2", "#d55e00", "#009e73"

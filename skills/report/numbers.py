@@ -44,7 +44,7 @@ from skills.learning.evaluation import dtw, measure
 from skills.learning.max_ent_irl import MaxEntIRL, recover_reward
 from skills.learning.policy import Policy, Rollout, learn_tabular, rollout, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.learning.slip import replay
+from skills.learning.slip_runs import replay
 from skills.packing import sha256
 from skills.planning.plan import SuturePoint, stack
 from skills.report import rivals

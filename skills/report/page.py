@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
+from skills.arithmetic import wilson
 from skills.gridworld import paper
 from skills.learning.evaluation import TIE_BREAK, measure
-from skills.learning.slip import BUDGET, wilson
+from skills.learning.slip_runs import BUDGET
 from skills.report.numbers import PAPER_PAIRS, SEEDS, Numbers, Row, Triple, as_printed
 from skills.report.rivals import SEED
 

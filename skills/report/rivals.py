@@ -20,10 +20,10 @@ from movement_primitives.dmp import DMP
 from skills.arrays import Bytes, Floats, Ints
 from skills.gridworld.grid import MOVES, GridPath
 from skills.gridworld.reward import sparse_reward
+from skills.gridworld.slip import STEADY, slip_model
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import Policy, Rollout, learn_tabular
-from skills.learning.slip import (
-    STEADY,
+from skills.learning.slip_runs import (
     Controller,
     FollowPolicy,
     Odds,
@@ -33,7 +33,6 @@ from skills.learning.slip import (
     StartAnew,
     Walks,
     budget,
-    draw_slips,
     judge,
     odds,
     shortest_way,
@@ -159,11 +158,11 @@ def disturb(ours: Policy, cell: Policy, primitive: Primitive, runs: int) -> tupl
 
 def _at(slip: float, ours: Policy, cell: Policy, primitive: Primitive, runs: int) -> Iterator[Disturbed]:
     path, moves = ours.path, budget(ours.path)
-    slips = draw_slips(slip, runs=runs, moves=moves, seed=SEED)
+    slips = slip_model(slip).draw(runs=runs, moves=moves, seed=SEED)
     solved = learn_tabular(sparse_reward(path, ours.levels), ValueIteration(slip=slip))
     without_drawing = {OURS: ours, SOLVED: solved}
     for by, run in _runners(ours, solved, cell, primitive).items():
-        exact = odds(without_drawing[by], slip, path.start, moves) if by in without_drawing else None
+        exact = odds(without_drawing[by], slip_model(slip), path.start, moves) if by in without_drawing else None
         yield Disturbed(by, slip, judge(run(slips)), exact)
 
 

@@ -1,11 +1,9 @@
 """Schemas of everything that crosses HTTP, declared once and used by the API and the client.
 
-- `requests`: request bodies; strict, unknown fields are refused. The library takes them as they are.
-- `given`: responses. Their parts are in `recordings`, `policies` and `comparison`, their common base and types of
-  fields are here. A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
-
-The library writes the JSON of a response, next to the use case of its noun (`plan_json` in `library/plans/plans.py`).
-Rows store most of it as it was computed.
+Answers and requests of a noun are in one module: `people`, `recordings`, `demos`, `datasets`, `comparison`, `scores`.
+The base class of requests and the types of their fields are in `requests`; requests are strict, unknown fields are
+refused.
+A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
 
 Lengths are mm; the frame of a position is in a field of its own.
 """

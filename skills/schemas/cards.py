@@ -12,8 +12,8 @@ from pydantic import Field
 from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
 from skills.gridworld.reward import RewardLevels
 from skills.schemas import DemoOutcome, Given, Grid, PolicyName
+from skills.schemas.demos import DemoReport
 from skills.schemas.policies import Combined, Coverage, GridCertificate, TrainingFigures
-from skills.schemas.recordings import DemoReport
 
 
 class CardPolicy(Given):

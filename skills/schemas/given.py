@@ -1,114 +1,12 @@
-"""All responses of the service, as models: routes declare them, and the client parses with them.
+"""Responses of the service itself: errors, liveness and readiness, the history, and its proofs."""
 
-Lengths are mm, angles rad, durations s, moments UTC; frames are named. Those of keys, errors,
-surgeons, suture types and the history are here, the others in the modules from which they are imported.
-"""
-
-from datetime import date, datetime
+from datetime import datetime
 from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
 from skills.fields import Count, Sha256, Slug
-from skills.schemas import Given, Handedness, Page, SkillLevel
-from skills.schemas.cards import PolicyCard
-from skills.schemas.comparison import Atlas, Nearest, Progress, RecognisedRecording, Score
-from skills.schemas.plans import Comparison, MotionTimeline, Plan, PlanSummary, Playback, Reach, Trajectory
-from skills.schemas.policies import (
-    Job,
-    NextPose,
-    NextStep,
-    Policy,
-    PolicySummary,
-    PoseStyle,
-    RetrainedStyle,
-    Retraining,
-    Rollout,
-    SessionOpening,
-    SessionPose,
-    Version,
-)
-from skills.schemas.recordings import (
-    DatasetEpisodes,
-    Demonstration,
-    DemoPath,
-    Proposal,
-    Recording,
-    RecordingPreview,
-    RecordingSummary,
-    RewardMap,
-    SuturePoints,
-)
-
-__all__ = [
-    "Alive",
-    "Atlas",
-    "Comparison",
-    "Consent",
-    "DatasetEpisodes",
-    "DemoPath",
-    "Demonstration",
-    "Job",
-    "Key",
-    "LeafProof",
-    "MotionTimeline",
-    "Nearest",
-    "NewKey",
-    "NextPose",
-    "NextStep",
-    "Page",
-    "Plan",
-    "PlanSummary",
-    "Playback",
-    "Policy",
-    "PolicyCard",
-    "PolicySummary",
-    "PoseStyle",
-    "Problem",
-    "Progress",
-    "Proposal",
-    "Reach",
-    "Ready",
-    "RecognisedRecording",
-    "Recording",
-    "RecordingPreview",
-    "RecordingSummary",
-    "RetrainedStyle",
-    "Retraining",
-    "RewardMap",
-    "Rollout",
-    "Score",
-    "ServedAt",
-    "SessionOpening",
-    "SessionPose",
-    "SignedCheckpoint",
-    "Surgeon",
-    "SuturePoints",
-    "SutureType",
-    "Trajectory",
-    "Version",
-    "WrongField",
-]
-
-
-class Key(Given):
-    """An API key, as an admin sees it: its owner and permissions; its secret is stored nowhere."""
-
-    key: str = Field(pattern=r"^[0-9a-f]{8}$", description="Its id, the part after `skills_`, which is no secret.")
-    owner: str = Field(description="Whose it is; events and releases bear this name.")
-    role: Literal["reader", "uploader", "trainer", "releaser", "admin"]
-    surgeons: list[Slug] | None = Field(description="The surgeons that it is restricted to; null: all.")
-    created_at: datetime
-    created_by: str
-    expires_at: datetime | None
-    revoked_at: datetime | None
-    state: Literal["active", "expired", "revoked"]
-
-
-class NewKey(Key):
-    """A key that was just created, with its secret."""
-
-    secret: str = Field(description="What to show as `X-API-Key`; nobody can show it again.")
+from skills.schemas import Given
 
 
 class WrongField(Given):
@@ -135,34 +33,6 @@ class Problem(Given):
     errors: list[WrongField] | None = Field(default=None, description="The fields of the request that are refused.")
     numbers: dict[str, Any] | None = Field(default=None, description="The numbers of the sentence, to compute with.")
     case: str | None = Field(default=None, description="Of a mistake of ours: report it.")
-
-
-class Consent(Given):
-    """The uses that a surgeon agreed to, and their last day."""
-
-    uses: list[Literal["training", "export", "atlas"]]
-    until: date | None = None
-
-
-class Surgeon(Given):
-    """A surgeon, known by a pseudonym."""
-
-    surgeon: Slug
-    skill_level: SkillLevel | None
-    handedness: Handedness | None
-    protocol: str | None
-    consent: Consent | None
-    created_at: datetime
-
-
-class SutureType(Given):
-    """A suture type of the catalogue."""
-
-    suture: Slug
-    name: str
-    also_called: list[str]
-    family: str
-    description: str
 
 
 class Alive(Given):

@@ -4,13 +4,12 @@ The verdict on a plan consists of gates, figures, and Monte Carlo probabilities 
 the plan. A figure is null if it could not be measured; a gate with such a figure has failed.
 """
 
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool, StrictInt
 
-from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema
+from skills.fields import Count, Point, Quaternion, Sha256, Slug
 from skills.gridworld.scene import Scene
 from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
 from skills.planning.handoff import Enters
@@ -26,27 +25,8 @@ from skills.planning.plan import (
 )
 from skills.planning.trajectory import MAX_SPEED_MM_S, Seam, Transfer
 from skills.schemas import Given, PolicyName
-from skills.schemas.requests import (
-    LINE,
-    Component,
-    Coordinate,
-    DigestField,
-    Name,
-    Number,
-    PointIn,
-    SceneIn,
-    Schema,
-    Size,
-    SlugField,
-    Source,
-    shown,
-)
-from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
-from skills.verification.probabilities import Doubt, Probability
-from skills.verification.reach import MAX_PLACES, ReachPlace
-from skills.verification.scene_clearance import SceneReport
-from skills.verification.timeline import Timeline
-from skills.verification.verdict import PlaybackReport
+from skills.schemas.requests import Component, Coordinate, Name, Number, PointIn, Schema, SlugField, shown
+from skills.schemas.scenes import SceneIn
 
 
 class SuturePointIn(Schema):
@@ -148,140 +128,6 @@ class PlanIn(Schema):
         description="none asks for a plan that hands nothing over: A1 alone. Without it a plan is refused for which "
         "neither psm_m nor the demonstration says where PSM_M is.",
     )
-
-
-class ErrorSources(Schema):
-    """For each size of an arm's errors its source, and the reason for its value."""
-
-    registration_mm: Source
-    registration_deg: Source
-    wrist_deg: Source
-    tip_bias_mm: Source
-    tip_noise_mm: Source
-    tip_correlation_s: Source
-
-
-class ArmErrorsIn(Schema):
-    """A laboratory's own errors of its arms, standard deviations along or about each axis (docs/errors.md)."""
-
-    name: Annotated[str, Field(min_length=1, max_length=60, pattern=LINE)]
-    registration_mm: Size = Field(description="Offset of PSM_M's base.")
-    registration_deg: Size = Field(description="Rotation of PSM_M's base about its remote centre.")
-    wrist_deg: Size = Field(description="Rotation of either arm's jaws about their hinge.")
-    tip_bias_mm: Size = Field(description="Offset of either arm that stays over a pass.")
-    tip_noise_mm: Size = Field(description="Offset of either arm that varies during a pass.")
-    tip_correlation_s: Size = Field(description="Correlation time of that noise.")
-    sources: ErrorSources
-
-
-class PlaybackIn(Schema):
-    """A playback: the plan to play in the simulator, and the errors of the arms to judge it under."""
-
-    model_config = shown({"plan": "0123456789abcdef" * 4}, {"plan": "0123456789abcdef" * 4, "errors": "calibrated"})
-
-    plan: DigestField
-    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = Field(
-        default=None, description="The errors of the arms that are to play it; by default those of the installation."
-    )
-
-    @property
-    def arm_errors(self) -> ArmErrors | None:
-        """The errors as a value of the domain."""
-        if self.errors is None or isinstance(self.errors, str):
-            return None if self.errors is None else NAMED[self.errors]
-        return checked_own(ArmErrors(**self.errors.model_dump()))
-
-
-MAX_ROTATIONS = 48
-Length = Annotated[Number, Field(ge=0, le=400)]
-
-
-class ReachIn(Schema):
-    """A map of the suture points at which a style can be planned: a box of places, and rotations of the grid world."""
-
-    model_config = shown(
-        {"surgeon": "kestrel", "suture": "simple-running", "size_mm": [40.0, 40.0, 0.0], "handoff": "none"}
-    )
-
-    surgeon: SlugField
-    suture: SlugField
-    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
-    centre_mm: PointIn | None = Field(
-        default=None, description="Middle of the box, in the frame of the arm; left out, the demonstrated goal."
-    )
-    size_mm: tuple[Length, Length, Length] = Field(default=(80.0, 80.0, 0.0), description="Edges of the box.")
-    step_mm: Annotated[Number, Field(ge=1, le=100)] = Field(
-        default=8.0, description=f"Distance of the places, of which there are at most {MAX_PLACES}."
-    )
-    rotations_xyzw: Annotated[
-        list[tuple[Component, Component, Component, Component]], Field(min_length=1, max_length=MAX_ROTATIONS)
-    ] = Field(
-        default=[(0.0, 0.0, 0.0, 1.0)],
-        description="Rotations of the grid world about each place, as of a suture point.",
-    )
-    orientation: Turning | None = Field(default=None, description="As in a plan; so are all that follow.")
-    a2: A2Target | None = None
-    tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
-        default=0.0, description=f"{JAW_TIP_MM:g} for the finger tips."
-    )
-    psm_m: PsmMIn | None = None
-    scene: SceneIn | None = None
-    tissue_mm: Coordinate | None = None
-    handoff: Literal["none"] | None = None
-
-    def plan_at(self, position_mm: PointIn) -> PlanIn:
-        """Return the request of a plan with one pass at this place for each rotation."""
-        alike = {name: getattr(self, name) for name in PlanIn.model_fields if name in type(self).model_fields}
-        points = [SuturePointIn(position_mm=position_mm, rotation_xyzw=turned) for turned in self.rotations_xyzw]
-        return PlanIn.model_construct(**alike, suture_points=points)
-
-
-class Reach(Given):
-    """Where a style can be planned.
-
-    `places` has all positions of the first rotation, x slowest and z fastest, then those of the second, and so on.
-    """
-
-    surgeon: Slug
-    suture: Slug
-    policy: PolicyName
-    arm: str
-    frame: str
-    step_mm: float
-    counts: tuple[Count, Count, Count] = Field(description="Number of places along x, y and z.")
-    rotations: Count
-    places: list[ReachPlace]
-    in_words: str
-
-
-@schema
-@dataclass(frozen=True, kw_only=True)
-class Verdict(PlaybackReport):
-    """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
-
-    Attributes:
-        failure_in_words: The failure as a sentence.
-        doubt: Probabilities of success in worlds that differ from the plan.
-        plan: Digest of the plan.
-        trajectory: Digest of the stamps and joints that were checked.
-        policy: The policy version that the plan follows.
-        frame: Frame of the plan.
-        scene: Distances from the plan's scene; null: it has none, so nothing was compared with tissue.
-        tissue: Whether the motion was compared with tissue.
-        stated_by: Source of the errors of the arms, the playback's request or the installation.
-        check_version: Version of the checks; a bag is given only of the present one.
-    """
-
-    failure_in_words: str | None
-    doubt: Doubt
-    plan: Sha256
-    trajectory: Sha256
-    policy: PolicyName
-    frame: str
-    scene: SceneReport | None
-    tissue: Literal["judged", "not given"]
-    stated_by: Literal["request", "installation"]
-    check_version: Count
 
 
 class Sources(Given):
@@ -402,81 +248,3 @@ class Trajectory(Given):
     rate_hz: float
     columns: list[str]
     rows: list[list[float]]
-
-
-class MotionTimeline(Given):
-    """A recording, a demonstration, a learnt path or a plan as columns on one clock, to be played."""
-
-    source: Literal["recordings", "demos", "policy-versions", "plans"]
-    sha256: Sha256
-    timeline: Timeline
-
-
-class StandingPolicy(PolicyName):
-    """The policy version that a plan follows, and whether it is released now."""
-
-    released: bool
-
-
-class PictureLinks(Given):
-    """Links to the pictures; all but the first are drawn after the verdict."""
-
-    picture: str
-    animation_mp4: str
-    animation_gif: str
-    joints: str
-    clearance: str
-
-
-class Headline(Given):
-    """A playback's headline: the verdict, the missing parts of the plan, and its probability of success."""
-
-    level: Literal["good", "caution", "bad"] = Field(
-        description="good: hands over, and succeeds as surely as the installation asks for a replay; bad: not "
-        "feasible, or surely succeeds in less than half of the worlds."
-    )
-    word: str = Field(description="The level in a word or two.")
-    text: str
-    errors: str = Field(
-        description="Name of the errors of the arms: those of the playback's request, or else of the installation."
-    )
-    probability: Probability | None = Field(description="Of the whole plan; null where it was not judged.")
-    counts: Literal["hand-over", "clearance"] | None = Field(
-        default=None,
-        description="The event of the probability: the needle is handed over in every pass, or, without a hand-off, "
-        "the motion only stays within reach and clear; null where it was not judged.",
-    )
-    not_judged: list[str] = Field(default=[], description="What the probability leaves out, in words.")
-    costs_most: str | None = Field(description="The error that costs the most, in words; null where none was judged.")
-
-
-class Playback(Given):
-    """The simulator's verdict on a plan."""
-
-    id: Sha256
-    sha256: Sha256
-    plan: Sha256
-    feasible: bool = Field(description="In an exact simulation, as far as the plan goes; read `headline`.")
-    headline: Headline | None = None
-    report: Verdict
-    picture: str
-    pictures: PictureLinks
-    created_at: datetime
-    policy: StandingPolicy
-
-
-class Comparison(Given):
-    """A recorded replay compared with a pass of its plan; triples are x, y and z."""
-
-    plan: Sha256
-    demo: Sha256
-    pass_index: Count = Field(alias="pass")
-    mean_mm: float
-    max_mm: float
-    start_mm: float = Field(description="Between the first samples.")
-    end_mm: float = Field(description="Between the last samples.")
-    dtw_mean_mm: Point
-    rmse_mm: Point
-    planned_s: float
-    recorded_s: float
-    tie_break: str

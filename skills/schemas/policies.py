@@ -2,157 +2,22 @@
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, StrictInt
 
-from skills.demonstration.partner import Partner
-from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema
+from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
+from skills.gridworld.hazards import SceneCosts
 from skills.gridworld.reward import RewardLevels
-from skills.gridworld.scene import Scene, SceneCosts
+from skills.gridworld.scene import Scene
 from skills.learning.certificate import NearOdds, NearStarts
-from skills.learning.dynamic_programming import ShortestWay
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.in_scene import SceneCertificate
 from skills.learning.q_learning import Training
-from skills.learning.tube_certificate import TubeCertificate, TubeClearance
+from skills.learning.ties import ShortestWay
 from skills.planning.plan import DrivenPass
-from skills.schemas import DemoOutcome, Given, Grid, Page, PolicyName, VersionNumber
-
-
-class ServedNow(PolicyName):
-    """The policy version that a style serves."""
-
-    released_at: datetime
-
-
-class Job(Given):
-    """A job: work that was requested, its state and its result."""
-
-    id: str = Field(pattern="^[0-9a-f]{16}$")
-    kind: str = Field(description="training, retraining, playback, pictures, dataset or try.")
-    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
-    progress: Fraction
-    request: dict[str, Any] = Field(description="What was asked for, all defaults resolved.")
-    result: dict[str, Any] | None = Field(
-        description="What came of it. Of a training, `released` says whether its version is what the style serves "
-        "now, `was_released` whether the job released it, and where a release was asked for, `not_released_because` "
-        "and `remedy` say why not and what to do. Of a try, `steps` are those so far, also while it runs."
-    )
-    served: ServedNow | None = Field(
-        default=None, description="Of a training: what its style serves now; null where that is nothing."
-    )
-    did: str | None = Field(default=None, description="Of a POST: what the request did, in words.")
-    error: str | None
-    created_at: datetime
-    started_at: datetime | None
-    ended_at: datetime | None
-
-
-@schema
-@dataclass(frozen=True, kw_only=True)
-class PolicyFigures:
-    """A policy version, and the figures of its agreement with its demonstrations.
-
-    Attributes:
-        rests_on: Number of demonstrations that it was learnt from.
-        dtw_total_mm: Distance from the path that it was learnt from.
-        exact_share: Share of the path's states.
-        reaching_share: Share of all states.
-        mean_share: Mean share of the demonstration that its starts follow.
-    """
-
-    version: VersionNumber
-    sha256: Sha256
-    demos: tuple[Sha256, ...]
-    rests_on: Count
-    dtw_total_mm: float
-    exact_share: Fraction
-    reaching_share: Fraction
-    mean_share: Fraction
-
-
-@schema
-@dataclass(frozen=True)
-class FitOnTheSame:
-    """DTW totals of both over all active demonstrations from which either was learnt.
-
-    Attributes:
-        demos: The demonstrations.
-        released_mm: Total of the released version; null if arms or frames differ, or there are no demonstrations.
-        trained_mm: Total of the new version; null as `released_mm`.
-    """
-
-    demos: tuple[Sha256, ...]
-    released_mm: float | None
-    trained_mm: float | None
-
-
-@schema
-@dataclass(frozen=True, kw_only=True)
-class StoredComparison:
-    """A new policy version compared with the released one, as it is stored.
-
-    Attributes:
-        released: The released version; null if nothing was released.
-        on_the_same: Both on the same demonstrations; null where nothing was released.
-        worse_because: The figures in which the new version is worse.
-        now_released: Whether the trained version is what the style serves now.
-        not_released_because: Why a requested release is not in force.
-    """
-
-    released: PolicyFigures | None
-    trained: PolicyFigures
-    same_demonstration: bool | None
-    on_the_same: FitOnTheSame | None
-    worse_because: tuple[str, ...]
-    now_released: bool
-    not_released_because: str | None
-
-
-@schema
-@dataclass(frozen=True, kw_only=True)
-class StyleComparison(StoredComparison):
-    """A new policy version compared with the released one, both on the same demonstrations.
-
-    Attributes:
-        was_released: Whether the batch released it.
-        remedy: What to do about a release that is not in force.
-    """
-
-    was_released: bool
-    remedy: str | None
-
-
-class RetrainedStyle(Given):
-    """The result of one style of a batch."""
-
-    surgeon: Slug
-    suture: Slug
-    demo: Sha256
-    stale_because: list[str]
-    state: Literal["queued", "done", "failed", "cancelled"]
-    reason: str | None
-    policy_version: int | None
-    sha256: Sha256 | None
-    comparison: StyleComparison | None
-    served: ServedNow | None = Field(default=None, description="What the style serves now; null: nothing.")
-    ended_at: datetime | None
-
-
-class StyleCounts(Given):
-    """The number of styles of a batch in each state."""
-
-    queued: Count
-    done: Count
-    failed: Count
-    cancelled: Count
-
-
-class Retraining(Job, Page[RetrainedStyle]):
-    """A batch: its job, the number of styles in each state, and one page of the styles."""
-
-    styles: StyleCounts
+from skills.schemas import DemoOutcome, Given, Grid, PolicyName
+from skills.schemas.requests import PointIn, Schema, shown
 
 
 @schema
@@ -422,130 +287,10 @@ class NextStep(PolicyName):
     correction_mm: Point | None = Field(description="The way back to the path; null on it.")
 
 
-class PartnerPose(Given):
-    """A pose of the other arm, PSM_M, as it was demonstrated relative to the hand-off, for one phase.
+class RolloutIn(Schema):
+    """A rollout: its start in mm, in the policy's frame, and the version; without `version`, the released one."""
 
-    No tube is certified for it: nothing is proven of how near that arm is to it, nor to the arm that follows the pose
-    style, nor of how far it moves in a tick. The caller checks the distance between the arms.
-    """
+    model_config = shown({"start_mm": [0.0, 50.0, -120.0]})
 
-    arm: str
-    position_mm: Point = Field(description="Of its tip, in the frame of the pose style.")
-    rotation_xyzw: Quaternion
-    jaw_rad: float | None = Field(description="null where its jaw was not recorded.")
-
-
-class PartnerPath(Given):
-    """The motion of the other arm, PSM_M, at the phases of the pose style, as demonstrated relative to the hand-off.
-
-    No tube is certified for it: the caller checks the distance between the arms. Its steps are not limited, and it is
-    neither refused nor changed beside a scene.
-    """
-
-    arm: str
-    position_mm: list[Point] = Field(description="Of its tip, in the frame of the pose style.")
-    rotation_xyzw: list[Quaternion]
-    jaw_rad: list[float] | None = Field(description="null where its jaw was not recorded.")
-    scene: TubeClearance | None = Field(
-        default=None,
-        description="How near it comes to the scene that the version was learnt in, of which a part may be this arm "
-        "itself; negative or 0 where it touches.",
-    )
-
-
-class PoseAnswer(Given):
-    """The next pose for a pose that was reached.
-
-    Outside the tube the certificate proves nothing: a client stops there, or brings the hand back by other means.
-    """
-
-    position_mm: Point
-    rotation_xyzw: Quaternion
-    jaw_rad: float | None
-    phase: Count = Field(description="After this tick; to be sent with the pose that is reached then.")
-    elapsed_s: float = Field(description="Time of that phase from the start of the motion.")
-    off_mm: float = Field(description="Distance of the pose that was sent from that of its phase.")
-    off_rad: float
-    inside: bool = Field(description="Whether the pose that was sent lies in the tube.")
-    finished: bool = Field(description="Whether the last pose was reached.")
-    partner_pose: PartnerPose | None = Field(
-        default=None,
-        description="Where the other arm was demonstrated to be at `phase`; no tube is certified for it, so check the "
-        "distance between the arms. null where its motion was not learnt.",
-    )
-
-
-class NextPose(PoseAnswer, PolicyName):
-    """The next pose of the pose style, to be reached within `tick_s`."""
-
-    frame: str
-    tick_s: float
-
-
-class SessionPose(PoseAnswer):
-    """The next pose of a session."""
-
-    newer_version: int | None = Field(description="Another version that was released since; the session keeps its own.")
-
-
-class SessionLimits(Given):
-    """What a session allows; more closes it."""
-
-    rate_hz: float
-    burst: float = Field(description="Messages at once.")
-    message_bytes: int
-    idle_s: float = Field(description="Without a message for so long it is closed.")
-
-
-class SessionOpening(PolicyName):
-    """The first message of a session: the version that it is pinned to, the tube, and the limits."""
-
-    arm: str
-    frame: str
-    phases: int
-    tick_s: float = Field(description="Time between two phases.")
-    tube: TubeCertificate
-    scene: TubeClearance | None = Field(
-        default=None,
-        description="The distance of the path from the scene that the version was learnt in; the tube is narrower.",
-    )
-    limits: SessionLimits
-
-
-class PoseStyle(PolicyName):
-    """The poses of a hand along one phase, learnt from the demonstrations of a policy version.
-
-    Phase k of N is the share k / (N - 1) of the time; the lists have an entry for each. The motion lies at the start
-    and the goal pose of one demonstration. `tube` certifies the rule by which `POST .../next` follows it.
-    """
-
-    format: Literal["suture-skills pose style 1"]
-    surgeon: Slug
-    suture: Slug
-    arm: str
-    frame: str
-    demos: list[Sha256]
-    position_mm: list[Point]
-    rotation_xyzw: list[Quaternion]
-    jaw_rad: list[float] | None = Field(description="null where a demonstration has no jaw.")
-    elapsed_s: list[float]
-    spread_mm: list[float] = Field(description="Standard deviation of the demonstrations about the path.")
-    spread_rad: list[float]
-    turn_share: float = Field(
-        default=1.0,
-        description="Where the orientations are between the shortest turn from start to goal, 0, and the mean of the "
-        "demonstrations, 1; below 1 they turn in unlike ways.",
-    )
-    tick_s: float = Field(description="Time between two phases.")
-    tube: TubeCertificate
-    scene: TubeClearance | None = Field(
-        default=None,
-        description="The distance of the path from the scene that the version was learnt in; the tube is narrower.",
-    )
-    partner: Partner | None = Field(description="The other arm as it took the needle, where that was recorded.")
-    partner_motion: PartnerPath | None = Field(
-        default=None,
-        description="The other arm's motion at the same phases, where every demonstration's recording has it all "
-        "along; no tube is certified for it.",
-    )
-    created_at: datetime
+    start_mm: PointIn
+    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None

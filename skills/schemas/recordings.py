@@ -1,20 +1,18 @@
-"""Response models of recordings and demonstrations."""
+"""Recordings: answers, and what a request states about one."""
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
 from skills.demonstration.identification import ArmIdentification
-from skills.demonstration.partner import Partner
-from skills.demonstration.quality import MotionReport
 from skills.demonstration.recording import BaseFrame, Column, Format, Topic
-from skills.demonstration.segments import Segment, TakenSegment
-from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema
-from skills.gridworld.grid import PathReport
-from skills.gridworld.reward import RewardLevels
-from skills.schemas import ChosenGrid, DemoOutcome, Given, ProposalState
+from skills.demonstration.segments import Segment
+from skills.fields import Count, Point, Quaternion, Sha256, schema
+from skills.kinematics import INSTRUMENTS
+from skills.schemas import Given
+from skills.schemas.requests import ARM, FRAME, LINE, Name, Schema, Text
 
 
 @schema
@@ -149,14 +147,9 @@ class LeftOut:
     because: str
 
 
-class Described(Given):
-    """The content of a raw file, its quality, and the proposed hand-offs."""
+class ContentLists(Given):
+    """The parts of a raw file, and the proposed hand-offs."""
 
-    sha256: Sha256
-    size_bytes: Count
-    media_type: str
-    format: str = Field(description=f"One of {', '.join(get_args(Format))}.")
-    integrity: Literal["full", "partial", "none"] = Field(description="How much of it a checksum vouches for.")
     notes: dict[str, str]
     topics: list[Topic]
     motions: list[Motion]
@@ -176,6 +169,23 @@ class Described(Given):
     identifications: list[ArmIdentification] = Field(description="What joints recorded beside poses show.")
 
 
+class RecordingContent(ContentLists):
+    """The content of a raw file, its quality, and the proposed hand-offs."""
+
+    duration_s: float
+    quality: list[Quality]
+
+
+class Described(ContentLists):
+    """The content of a raw file with its identity, and the proposed hand-offs."""
+
+    sha256: Sha256
+    size_bytes: Count
+    media_type: str
+    format: str = Field(description=f"One of {', '.join(get_args(Format))}.")
+    integrity: Literal["full", "partial", "none"] = Field(description="How much of it a checksum vouches for.")
+
+
 class Recording(Described):
     """A raw file as it was uploaded: its content, its quality, and the proposed hand-offs."""
 
@@ -183,33 +193,6 @@ class Recording(Described):
     duration_s: float
     quality: list[Quality]
     created_at: datetime
-
-
-class Proposal(Given):
-    """A proposed hand-off of a recording, and what was decided on it."""
-
-    recording: Sha256
-    number: int = Field(description="Its number in the recording, counted from 1.")
-    state: ProposalState = Field(
-        description="accepted: a demonstration was cut there, which shares at least half of the longer of the two."
-    )
-    arm: str
-    start_s: float = Field(description="Seconds since the recording's `origin_ns`.")
-    end_s: float
-    handover_s: float = Field(description="Transition from A1 to A2.")
-    found_by: str = Field(description="The source: stage, gesture, transfer, jaw or motion.")
-    reasons: list[str]
-    confidence: Fraction | None = Field(
-        description="Probability that the needle was given to another arm; null unless found by a transfer."
-    )
-    surgeon: Slug | None = Field(
-        description="Of its demonstration, else the only one that the recording was uploaded for."
-    )
-    suture: Slug | None = Field(description="Of its demonstration; null if there is none.")
-    demo: Sha256 | None = Field(description="The demonstration, active or withdrawn.")
-    outcome: DemoOutcome | None = Field(description="Of the demonstration.")
-    note: str | None = Field(description="Why it was rejected, or the reason of the outcome.")
-    created_at: datetime = Field(description="Of the recording.")
 
 
 class RecordingSummary(Given):
@@ -284,85 +267,50 @@ class SuturePoints(Given):
     points: tuple[SuturePoint, ...]
 
 
-@schema
-@dataclass(frozen=True, kw_only=True)
-class DemoReport(PathReport, MotionReport):
-    """Measurements of a demonstration, and advice.
-
-    Attributes:
-        duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
-        backward_stamps: Samples of the entire recorded motion that were dropped because their stamp went back.
-        equal_samples: Samples of the demonstration that repeat the pose of the sample before to the last bit.
-        grid: The grid world of its path.
-        partner: The arm that takes the needle; null if it was not recorded.
-        advice: Sentences to the surgeon.
-    """
-
-    duplicate_stamps: Count
-    backward_stamps: Count
-    equal_samples: Count
-    grid: ChosenGrid
-    partner: Partner | None
+READING = {"column", "unit", "decimal", "table_arm", "instrument"}
 
 
-class DatasetEpisode(Given):
-    """The origin of an episode of a dataset, which names none of this itself."""
+class Reading(Schema):
+    """Statements about a recording that the recording itself does not make."""
 
-    recording: Sha256
-    demos: list[Sha256] = Field(description="The exported demonstrations in it; one, unless it is a whole recording.")
+    rate_hz: Annotated[float, Field(gt=0, le=10_000)] | None = Field(
+        default=None, description="Samples per second, of a table without times."
+    )
+    frame: Annotated[str, Field(pattern=FRAME)] | None = Field(
+        default=None,
+        description="The frame of the poses in a table or a LeRobot dataset; base, the default for a table of one arm: "
+        "the arm's base.",
+    )
 
-
-class DatasetEpisodes(Given):
-    """The origins of a dataset's episodes, in the order of their numbers."""
-
-    whole: bool = Field(description="Whether each episode is a whole recording.")
-    episodes: list[DatasetEpisode]
-
-
-class Demonstration(Given):
-    """One hand-off cut out of a recording, with its measurements."""
-
-    id: Sha256
-    sha256: Sha256
-    recording: Sha256
-    surgeon: Slug
-    suture: Slug
-    arm: str
-    topic: str
-    frame: str
-    instrument: str
-    start_s: float
-    end_s: float
-    segment: TakenSegment = Field(description="Which part of the recording was taken.")
-    session: Slug | None
-    hysteresis: float = Field(description="Cells.")
-    state: Literal["active", "withdrawn"]
-    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off; null: not known.")
-    outcome_reason: str | None = Field(default=None, description="Why, in the words of whoever marked it.")
-    report: DemoReport
-    created_at: datetime
-    withdrawn_at: datetime | None
+    @property
+    def said(self) -> dict[str, Any]:
+        """The reader's arguments: rate and frame, and of the others those that were given, as they are stored."""
+        given = self.model_dump(include=READING, exclude_none=True)
+        return {"rate_hz": self.rate_hz, "frame": self.frame, **given}
 
 
-class DemoPath(Given):
-    """A demonstration as its states in the grid, and as it was recorded."""
+class TableIn(Reading):
+    """Statements about a table (docs/tables.md)."""
 
-    demo: Sha256
-    frame: str
-    grid: ChosenGrid
-    hysteresis: float
-    states: list[int]
-    path_mm: list[Point] = Field(description="The centres of the states.")
-    stamps_s: list[float]
-    recorded_mm: list[Point]
+    column: Annotated[list[Annotated[str, Field(max_length=200, pattern=LINE)]], Field(max_length=30)] | None = Field(
+        default=None,
+        description="A column under another name, of a table as x_mm=NAME, or as x=NAME with a unit (docs/tables.md).",
+    )
+    unit: Annotated[list[Literal["m", "mm", "rad", "deg", "s", "ms", "us", "ns"]], Field(max_length=3)] | None = Field(
+        default=None, description="The unit of columns that name none, of lengths, angles or times."
+    )
+    decimal: Literal["point", "comma"] | None = Field(default=None, description="The decimal mark; point by default.")
+    table_arm: Annotated[str, Field(pattern=ARM)] | None = Field(
+        default=None, description="The arm of a table; PSM by default."
+    )
+    instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = Field(
+        default=None, description="The instrument with which a table's joints become poses."
+    )
 
 
-class RewardMap(Given):
-    """The rewards of a demonstration other than `other`: `rewards[k]` is that of `states[k]`."""
+class StatedIn(TableIn):
+    """What a folder's owner states about recordings for `skills recording table` (docs/recordings.md)."""
 
-    demo: Sha256
-    sha256: Sha256
-    grid: ChosenGrid
-    levels: RewardLevels
-    states: list[int]
-    rewards: list[float]
+    source: Text = ""
+    episode: Name | None = None
+    tool: list[Name] | None = None

@@ -11,7 +11,8 @@ from pydantic import Field, StrictBool
 
 from skills.gridworld.grid import MAX_HYSTERESIS
 from skills.schemas import Given
-from skills.schemas.plans import ArmErrorsIn, PsmMIn
+from skills.schemas.plans import PsmMIn
+from skills.schemas.playbacks import ArmErrorsIn
 from skills.schemas.requests import Coordinate, DigestField, Schema, SlugField, shown
 from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
 

@@ -30,7 +30,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from skills.arrays import Flags, Floats, Ints, frozen
+from skills.arrays import Flags, Floats, Ints, freeze
 from skills.errors import BadInput
 from skills.scoring.features import THIRDS, TRIAL_NAMES
 
@@ -78,12 +78,9 @@ class Cohort:
 
     def __post_init__(self) -> None:
         count = len(self.tasks)
-        object.__setattr__(self, "values", frozen(self.values, np.float64, (count, None, None), "values"))
-        shape = (count, self.values.shape[1], THIRDS, self.values.shape[2])
-        object.__setattr__(self, "thirds", frozen(self.thirds, np.float64, shape, "thirds"))
-        object.__setattr__(self, "ratings", frozen(self.ratings, np.float64, (count, OUTCOMES), "ratings"))
-        for name in ("tasks", "surgeons", "repetitions", "levels"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.int64, (count,), name))
+        freeze(self, values=(count, None, None), ratings=(count, OUTCOMES))
+        freeze(self, thirds=(count, self.values.shape[1], THIRDS, self.values.shape[2]))
+        freeze(self, np.int64, tasks=(count,), surgeons=(count,), repetitions=(count,), levels=(count,))
         for task, name in enumerate(self.names):
             here = self.tasks == task
             surgeons = len(np.unique(self.surgeons[here]))
@@ -383,17 +380,10 @@ class SkillModel:
 
     def __post_init__(self) -> None:
         tasks, count, levels = len(self.tasks), len(self.figures), len(LEVELS)
-        shapes: dict[str, tuple[int, ...]] = {
-            **dict.fromkeys(("centre", "scale", "lowest", "highest"), (tasks, count)),
-            **dict.fromkeys(("thirds_centre", "thirds_scale"), (tasks, THIRDS, count)),
-            "means": (tasks, OUTCOMES),
-            "weights": (tasks, OUTCOMES, count),
-            "margins": (tasks,),
-            "level_ratings": (tasks, levels),
-            "level_shares": (tasks, levels, levels),
-        }
-        for name, shape in shapes.items():
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        freeze(self, **dict.fromkeys(("centre", "scale", "lowest", "highest"), (tasks, count)))
+        freeze(self, thirds_centre=(tasks, THIRDS, count), thirds_scale=(tasks, THIRDS, count), margins=(tasks,))
+        freeze(self, means=(tasks, OUTCOMES), weights=(tasks, OUTCOMES, count))
+        freeze(self, level_ratings=(tasks, levels), level_shares=(tasks, levels, levels))
 
     def standard(self, task: int, values: Floats) -> Floats:
         """Return figures of trials of a task, (..., F), in standard deviations from the task's means."""

@@ -31,12 +31,13 @@ from skills.comparison.distances import PARTS, STATES, TREMOR_S, Difference, dif
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip, spans_of
 from skills.fields import Point, schema
-from skills.kinematics import matrix_of
+from skills.kinematics import quaternion_of
 from skills.learning.evaluation import dtw
+from skills.learning.pose_style import mean_rotation
+from skills.quaternions import INVERSE, angle_of, multiplied, unit
 
 NEAR_MM = 1.0  # mean distance; a fifth of the paper's cell, and the drift of a held hand in a second
-TOLD_SHARE = 0.2  # of the total, in one third along one axis; each has a ninth if none stands out
-TOLD = 3  # places at most
+NAMED_SHARE = 0.2  # of the total, in one third along one axis; each has a ninth if none stands out
 ONE_SIDED = 0.5  # part of the mean difference at a place: below it the path goes to both sides of the reference's
 Sides = tuple[tuple[str, str], ...]
 SIDES = (("behind", "ahead"), ("to the right", "to the left"), ("lower", "higher"))  # of the path; negative, positive
@@ -139,14 +140,14 @@ def deviation(path_mm: Floats, reference_mm: Floats, sides: Sides = OWN_SIDES) -
         dtw_std_mm=xyz(pairs_mm.std(axis=0)),
         shares=_thirds(found.shares),
         offsets_mm=_thirds(found.offsets),
-        words=_in_words(found, sum(mean_mm), apart_mm, sides),
+        words=_describe(found, sum(mean_mm), apart_mm, sides),
         path_mm=tuple(map(xyz, path_mm)),
         reference_mm=tuple(map(xyz, reference_mm)),
         apart_mm=tuple(apart_mm.tolist()),
     )
 
 
-def _in_words(found: Difference, mean_mm: float, apart_mm: Floats, sides: Sides) -> tuple[str, ...]:
+def _describe(found: Difference, mean_mm: float, apart_mm: Floats, sides: Sides) -> tuple[str, ...]:
     """Describe a deviation; `mean_mm` is the mean Manhattan distance of the pairs."""
     if mean_mm <= NEAR_MM:
         return (f"The path follows the reference all along: {mean_mm:.1f} mm from it on average.",)
@@ -162,9 +163,9 @@ def _in_words(found: Difference, mean_mm: float, apart_mm: Floats, sides: Sides)
 def _places(found: Difference, sides: Sides) -> Iterator[str]:
     shares, offsets = found.shares, found.offsets
     states = np.arange(len(found.along)) * len(PARTS) // len(found.along)
-    for flat in np.argsort(-shares, axis=None, kind="stable")[:TOLD]:
+    for flat in np.argsort(-shares, axis=None, kind="stable")[:NAMED]:
         part, axis = (int(index) for index in np.unravel_index(int(flat), shares.shape))
-        if not shares[part, axis] >= TOLD_SHARE:
+        if not shares[part, axis] >= NAMED_SHARE:
             return
         typical = float(np.abs(found.along[states == part, axis]).mean())
         offset = float(offsets[part, axis])
@@ -181,7 +182,7 @@ def _thirds(values: Floats) -> Thirds:
     return first, middle, last
 
 
-NAMED = 3
+NAMED = 3  # at most
 LEAST = 3.2  # standard deviations of the expert's own motions
 ASSUMED = 1.5  # motions that the assumed spread counts for
 AROUND = 5  # states before and after one whose times belong to it
@@ -266,7 +267,7 @@ class Traced:
     shape_mm: Floats  # (STATES, 3)
     moving_s: Floats  # (STATES,), cumulated
     resting_s: Floats  # (STATES,), cumulated
-    rotations: Floats | None  # (STATES, 3, 3)
+    turns_xyzw: Floats | None  # (STATES, 4), unit quaternions
 
     def numbers(self) -> Floats:
         """Return the compared numbers that need no mean, shape (4, STATES): to the side, height, time, pause."""
@@ -293,7 +294,8 @@ def differences(demo: Demo, expert: Sequence[Demo], reference: Demo) -> Differen
     for kind, (signed, spread) in enumerate(deviations):
         if signed is not None:
             found += [(kind, *one) for one in _regions(np.abs(signed) / spread, least)]
-    said = (_named(mine, theirs, deviations[kind][0], kind, where, spreads) for kind, where, spreads in _ranked(found))
+    ranked = sorted(found, key=lambda one: -one[2])
+    said = (_named(mine, theirs, deviations[kind][0], kind, where, spreads) for kind, where, spreads in ranked)
     named = [one for one in said if one is not None][:NAMED]
     return Differences(len(theirs), tuple(named), tuple(one.words for one in named) or (_none(len(theirs)),))
 
@@ -329,13 +331,12 @@ def traced(demo: Demo, onto_mm: Floats) -> Traced:
     def mean(values: Floats) -> Floats:
         return np.bincount(pairs[:, 1], values[pairs[:, 0]], STATES) / count
 
-    rotations = None
+    turns = None
     if demo.rotation_xyzw is not None:
         turned = smoothed_tip(demo.stamps_s, same_signs(demo.rotation_xyzw), TREMOR_S)[1]
         there = np.stack([mean(np.interp(at_mm, along_mm, axis)) for axis in turned.T], axis=1)
-        there /= np.linalg.norm(there, axis=1, keepdims=True).clip(1e-12)
-        rotations = own_axes(resampled(tip_mm)) @ matrix_of(there)
-    return Traced(np.stack([mean(axis) for axis in shape_mm.T], axis=1), mean(clocks[0]), mean(clocks[1]), rotations)
+        turns = multiplied(quaternion_of(own_axes(resampled(tip_mm))[None])[0], unit(there))
+    return Traced(np.stack([mean(axis) for axis in shape_mm.T], axis=1), mean(clocks[0]), mean(clocks[1]), turns)
 
 
 def _by_phase(shape_mm: Floats, onto_mm: Floats) -> Floats:
@@ -374,13 +375,13 @@ def _deviations(mine: Traced, theirs: Sequence[Traced]) -> list[_Apart]:
             mine.numbers() - mean, (numbers - mean).transpose(1, 0, 2), (KINDS[0], KINDS[1], *KINDS[3:]), strict=True
         )
     ]
-    rotations = [one.rotations for one in theirs if one.rotations is not None]
-    if mine.rotations is None or len(rotations) < len(theirs):
+    turns = [one.turns_xyzw for one in theirs if one.turns_xyzw is not None]
+    if mine.turns_xyzw is None or len(turns) < len(theirs):
         found.insert(2, (None, np.ones(STATES)))
     else:
-        middle = _mean_rotation(rotations)
-        apart = np.array([_angles_deg(middle, one) for one in rotations])
-        found.insert(2, (_angles_deg(middle, mine.rotations), _spread(apart, KINDS[2].usual)))
+        middle = mean_rotation(np.array(turns), np.ones(len(turns)))
+        apart = np.array([_angles_deg(middle, one) for one in turns])
+        found.insert(2, (_angles_deg(middle, mine.turns_xyzw), _spread(apart, KINDS[2].usual)))
     return found
 
 
@@ -404,21 +405,12 @@ def _own_spread(theirs: Sequence[Traced]) -> list[float]:
     return largest
 
 
-def _mean_rotation(rotations: Sequence[Floats]) -> Floats:
-    """Return the rotation nearest to several at each state, shape (STATES, 3, 3): the projection of their mean."""
-    left, _, right = np.linalg.svd(np.mean(rotations, axis=0))
-    flip = np.sign(np.linalg.det(left @ right))
-    left[:, :, 2] *= flip[:, None]
-    return np.asarray(left @ right)
+def _angles_deg(turns: Floats, others: Floats) -> Floats:
+    """Return the angle between two orientations at each state, in degrees."""
+    return np.degrees(angle_of(multiplied(turns * INVERSE, others)))
 
 
-def _angles_deg(rotations: Floats, others: Floats) -> Floats:
-    """Return the angle between two rotations at each state, in degrees."""
-    trace = np.einsum("nij,nij->n", rotations, others)
-    return np.asarray(np.degrees(np.arccos(((trace - 1.0) / 2.0).clip(-1.0, 1.0))))
-
-
-# ---- places and words -----------------------------------------------------------------------------------------------
+# ---- places and sentences ------------------------------------------------------------------------------------------
 
 Region = tuple[int, int]  # first and last state
 
@@ -443,10 +435,6 @@ def _around_it(above: Flags, at: int) -> Region:
     while last < STATES - 1 and above[last + 1]:
         last += 1
     return first, last
-
-
-def _ranked(found: list[tuple[int, Region, float]]) -> list[tuple[int, Region, float]]:
-    return sorted(found, key=lambda one: -one[2])
 
 
 def _named(
@@ -481,8 +469,8 @@ def _named(
 def _expert_at(theirs: Sequence[Traced], kind: int, at: int) -> float:
     """Return the expert's mean at a state: mm beside or above the straight line, or degrees since the start."""
     if KINDS[kind].name == "wrist":
-        rotations = [one.rotations for one in theirs if one.rotations is not None]
-        return float(np.mean([_angles_deg(one[[0]], one[[at]])[0] for one in rotations]))
+        turns = [one.turns_xyzw for one in theirs if one.turns_xyzw is not None]
+        return float(np.mean([_angles_deg(one[0], one[at]) for one in turns]))
     return float(np.mean([one.shape_mm[at, 1 + kind] for one in theirs]))
 
 

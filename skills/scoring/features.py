@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skills.arrays import Floats, Ints, frozen
+from skills.arrays import Floats, Ints, freeze
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.motion import Motion, Signal
 from skills.demonstration.movement import MOVING_MM_S, SMOOTHING_S, Movement, movement_of, smoothed_tip
@@ -170,8 +170,7 @@ class TrialFigures:
 
     def __post_init__(self) -> None:
         sides = len(self.values)
-        object.__setattr__(self, "values", frozen(self.values, np.float64, (sides, len(TRIAL_KINDS)), "values"))
-        object.__setattr__(self, "thirds", frozen(self.thirds, np.float64, (sides, THIRDS, len(TRIAL_KINDS)), "thirds"))
+        freeze(self, values=(sides, len(TRIAL_KINDS)), thirds=(sides, THIRDS, len(TRIAL_KINDS)))
 
 
 def measure_trial(recording: Recording) -> TrialFigures:

@@ -8,9 +8,8 @@ the calibration's trials, show where the motion differs; these do not add up to 
 trial are not sums of those of its parts.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -19,9 +18,9 @@ from skills.errors import BadInput
 from skills.fields import Fraction, Sha256, schema
 from skills.scoring.calibration import LEAST_RATING, LEVELS, MOST_RATING, PARTS, SkillModel
 from skills.scoring.features import SIDES, TRIAL_KIND_OF, FigureKind, TrialFigures, TrialKind
-from skills.scoring.validation import known_parts, level_refusals
+from skills.scoring.validation import TaskValidation, known_parts, level_refusals
 
-TOLD = 3  # terms in words
+NAMED = 3  # terms in the sentence
 THIRD_NAMES = ("first", "middle", "last")
 
 
@@ -85,7 +84,7 @@ def unrated(why: str) -> Skill:
     return Skill(calibrated=False, calibration=None, words=(why,))
 
 
-def rate(model: SkillModel, name: str, trial: TrialFigures, calibration: str, judged: Mapping[str, Any]) -> Skill:
+def rate(model: SkillModel, name: str, trial: TrialFigures, calibration: str, judged: TaskValidation) -> Skill:
     """Rate a trial.
 
     Args:
@@ -93,7 +92,7 @@ def rate(model: SkillModel, name: str, trial: TrialFigures, calibration: str, ju
         name: The trial's task, one of the model's.
         trial: Its figures.
         calibration: Digest of the calibration that the model is part of.
-        judged: `TaskValidation` of the task, as a mapping; the task is one that may be rated.
+        judged: The model judged on the task, which is one that may be rated.
 
     Raises:
         BadInput: The model needs the masters, and they were not recorded.
@@ -115,10 +114,10 @@ def rate(model: SkillModel, name: str, trial: TrialFigures, calibration: str, ju
     levels = dict(zip(LEVELS, model.level_shares[task, said].tolist(), strict=True))
     outside = tuple(_outside(model, task, values))
     words = [
-        _quality_in_words(name, judged),
+        _describe_quality(name, judged),
         f"It would rate the whole recording {rating:.1f} of 30 (90 %: {low:.1f} to {high:.1f}).",
-        _terms_in_words(terms),
-        _thirds_in_words(terms),
+        _describe_terms(terms),
+        _describe_thirds(terms),
     ]
     if levels_refused:
         words.append(f"It gives no skill level. {' '.join(levels_refused)}")
@@ -167,22 +166,21 @@ def _terms(model: SkillModel, task: int, values: Floats, thirds: Floats) -> Iter
         )
 
 
-def _quality_in_words(name: str, judged: Mapping[str, Any]) -> str:
-    ours, chance = judged["model"], judged["chance"]
-    low, high = ours["rho_interval"]
+def _describe_quality(name: str, judged: TaskValidation) -> str:
+    low, high = judged.model.rho_interval
     return (
-        f"Calibrated on {judged['trials']} rated trials of {name} by {judged['surgeons']} surgeons. For a surgeon left "
-        f"out of the fit, it orders trials with a rank correlation of {ours['rho']:.2f} ({low:.2f} to {high:.2f}; "
-        f"shorter trials first: {judged['rivals']['shorter_first']['rho']:.2f}, chance: {chance['rho']:.2f})."
+        f"Calibrated on {judged.trials} rated trials of {name} by {judged.surgeons} surgeons. For a surgeon left "
+        f"out of the fit, it orders trials with a rank correlation of {judged.model.rho:.2f} ({low:.2f} to {high:.2f}; "
+        f"shorter trials first: {judged.rivals['shorter_first'].rho:.2f}, chance: {judged.chance.rho:.2f})."
     )
 
 
-def _terms_in_words(terms: Sequence[Term]) -> str:
-    most = ", ".join(f"{term.label} {term.points:+.1f}" for term in terms[:TOLD])
+def _describe_terms(terms: Sequence[Term]) -> str:
+    most = ", ".join(f"{term.label} {term.points:+.1f}" for term in terms[:NAMED])
     return f"From the mean of these trials, the rating moves most by: {most} points."
 
 
-def _thirds_in_words(terms: Sequence[Term]) -> str:
+def _describe_thirds(terms: Sequence[Term]) -> str:
     sums = [sum(term.thirds[third] for term in terms) for third in range(len(THIRD_NAMES))]
     worst = int(np.argmin(sums))
     cause = min(terms, key=lambda term: term.thirds[worst])

@@ -19,9 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from skills.arithmetic import wilson
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput
-from skills.learning.slip import wilson
+from skills.fields import parse_json
 from skills.scoring.calibration import (
     PARTS,
     Cohort,
@@ -48,7 +49,6 @@ RIVALS = {
 }
 DURATIONS = ("shorter_first", "duration")
 SEEN = ("same_surgeon",)  # rivals that have seen the surgeon, beside a repetition left out
-UNKNOWN = (np.nan, np.nan)
 NOTHING: Callable[[float], None] = lambda share: None  # noqa: E731
 
 
@@ -116,6 +116,15 @@ class TaskValidation:
     over_duration: tuple[float, float]
 
 
+def parse_task(stored: Mapping[str, Any]) -> TaskValidation:
+    """Return the validation of a task from the JSON that is stored with a model.
+
+    Args:
+        stored: The validation as plain JSON, as `dataclasses.asdict` writes it.
+    """
+    return parse_json(TaskValidation, stored)
+
+
 @dataclass(frozen=True)
 class Validation:
     """A model judged on surgeons left out.
@@ -132,7 +141,7 @@ class Validation:
 
 
 def validate(
-    cohort: Cohort, *, seed: int = 0, permutations: int = PERMUTATIONS, told: Callable[[float], None] = NOTHING
+    cohort: Cohort, *, seed: int = 0, permutations: int = PERMUTATIONS, progress: Callable[[float], None] = NOTHING
 ) -> tuple[HeldOut, Validation]:
     """Judge the model on surgeons left out.
 
@@ -140,7 +149,7 @@ def validate(
         cohort: The rated trials.
         seed: Seed of the bootstrap and the permutations.
         permutations: Number of permutations for chance.
-        told: Progress callback, called with the finished share, 0 to 1.
+        progress: Callback, called with the finished share, 0 to 1.
 
     Returns:
         The model's predictions for surgeons left out, and the quality of the model, of its trivial rivals, and of
@@ -153,7 +162,7 @@ def validate(
     found = held_out(cohort)
     series, levels = _predictions(cohort, found)
     rhos, drawn = _rhos(cohort, series, np.random.default_rng(seed))
-    permuted = _permuted(cohort, np.random.default_rng([seed, 1]), permutations, told)
+    permuted = _permuted(cohort, np.random.default_rng([seed, 1]), permutations, progress)
 
     def judged(rhos: Floats, drawn: Floats, rows: Ints | None = None) -> dict[str, Judged]:
         found = {name: _judged(*of_one) for name, *of_one in zip(series, rhos, drawn, strict=True)}
@@ -187,11 +196,11 @@ def validate(
         Chance(permutations, rho=float(by_chance.mean()), rho_p=_p(by_chance, mean["model"].rho)),
         dict(zip(series, drawn.mean(axis=0), strict=True)),
     )
-    chosen = {_design_in_words(design): count for design, count in found.chosen.items() if count}
+    chosen = {_describe_design(design): count for design, count in found.chosen.items() if count}
     return found, Validation(tasks, overall, chosen)
 
 
-def _design_in_words(design: Design) -> str:
+def _describe_design(design: Design) -> str:
     side = "instruments and masters" if design.masters else "instruments"
     return f"{side}, tasks {'together' if design.together else 'apart'}, strength {design.strength:g}"
 
@@ -290,7 +299,9 @@ class _Permuted:
     rights: Floats
 
 
-def _permuted(cohort: Cohort, rng: np.random.Generator, permutations: int, told: Callable[[float], None]) -> _Permuted:
+def _permuted(
+    cohort: Cohort, rng: np.random.Generator, permutations: int, progress: Callable[[float], None]
+) -> _Permuted:
     orders = np.stack([shuffled(cohort, rng) for _ in range(permutations)], axis=1)
     rhos, rights = (np.empty((len(cohort.names), permutations)) for _ in range(2))
     for first, last in pairwise([*range(0, permutations, PERMUTED_AT_ONCE), permutations]):
@@ -299,7 +310,7 @@ def _permuted(cohort: Cohort, rng: np.random.Generator, permutations: int, told:
         for task, rows in enumerate(cohort.by_task):
             rhos[task, first:last] = rank_correlations(held.scores[rows, 0].T[None], ratings[rows].T)[0]
             rights[task, first:last] = (held.levels[rows] == levels[rows]).mean(axis=0)
-        told(last / permutations)
+        progress(last / permutations)
     return _Permuted(rhos, rights)
 
 
@@ -345,90 +356,79 @@ def check_permutations(permutations: int) -> None:
         )
 
 
-def refusals(judged: Mapping[str, Any]) -> list[str]:
+def refusals(judged: TaskValidation) -> list[str]:
     """Return the reasons why a task is not rated, one sentence each.
 
     There is none if its ratings are better than chance and than the duration alone. Every comparison is written so that
-    a missing figure or NaN refuses the model.
+    NaN refuses the model.
 
     Args:
-        judged: `TaskValidation` as a mapping, as it is stored with a model.
+        judged: The model judged on the task.
     """
-    ours, chance = judged.get("model", {}), judged.get("chance", {})
-    rho, (low, high) = ours.get("rho", np.nan), ours.get("rho_interval", UNKNOWN)
-    by_chance, rho_p = chance.get("rho", np.nan), chance.get("rho_p", np.nan)
-    more_low, more_high = judged.get("over_duration", UNKNOWN)
+    rho, (low, high) = judged.model.rho, judged.model.rho_interval
+    by_chance, (more_low, more_high) = judged.chance.rho, judged.over_duration
     why = []
     if not (low > 0 and low > by_chance):
         why.append(
             f"Its rank correlation may be no better than by chance ({rho:.2f}, 95 %: {low:.2f} to {high:.2f}; by "
             f"chance {by_chance:.2f})."
         )
-    if not rho_p <= ACCEPTED_P:
-        why.append(f"A random order does as well ({_in_words(rho_p, chance)}).")
+    if not judged.chance.rho_p <= ACCEPTED_P:
+        why.append(f"A random order does as well ({_describe_p(judged.chance.rho_p, judged.chance)}).")
     if not more_low > 0:
-        rivals = judged.get("rivals", {})
-        duration = max(rivals.get(name, {}).get("rho", np.nan) for name in DURATIONS)
+        duration = max(judged.rivals[name].rho for name in DURATIONS)
         why.append(
             f"It may order trials no better than the duration alone ({duration:.2f}; the difference is "
             f"{more_low:.2f} to {more_high:.2f})."
         )
-    if why and judged.get("surgeons", 0) < ENOUGH[0]:
+    if why and judged.surgeons < ENOUGH[0]:
         why.append(
-            f"There are {judged.get('surgeons', 0)} surgeons; so few leave such intervals wide, and about {ENOUGH[0]} "
+            f"There are {judged.surgeons} surgeons; so few leave such intervals wide, and about {ENOUGH[0]} "
             f"with {ENOUGH[1]} trials each are needed."
         )
     return why
 
 
-def level_refusals(judged: Mapping[str, Any]) -> list[str]:
+def level_refusals(judged: TaskValidation) -> list[str]:
     """Return the reasons why the levels of a rated task are not given; none if they are better than the rivals' too.
 
     A surgeon's level is stated by the surgeon and need not follow the ratings, so it is judged by itself.
 
     Args:
-        judged: As for `refusals`, of a task and not of the mean.
+        judged: The model judged on a task, and not on the mean of several.
     """
-    ours, chance = judged.get("model", {}), judged.get("chance", {})
-    duration = judged.get("rivals", {}).get("duration", {})
-    right_p = chance.get("accuracy_p", np.nan)
-    right, commonest, by_duration = (
-        100 * of.get(name, np.nan) for of, name in ((ours, "accuracy"), (chance, "commonest"), (duration, "accuracy"))
-    )
+    given = judged.model.accuracy, judged.chance.commonest, judged.rivals["duration"].accuracy, judged.chance.accuracy_p
+    right, commonest, by_duration, right_p = (np.nan if one is None else one for one in given)
     why = []
     if not right_p <= ACCEPTED_P:
-        why.append(f"Random levels are right as often ({_in_words(right_p, chance)}).")
+        why.append(f"Random levels are right as often ({_describe_p(right_p, judged.chance)}).")
     if not (right > commonest and right > by_duration):
         why.append(
-            f"It is right about the level in {right:.0f} % of the trials, the most frequent level in "
-            f"{commonest:.0f} %, the duration alone in {by_duration:.0f} %."
+            f"It is right about the level in {100 * right:.0f} % of the trials, the most frequent level in "
+            f"{100 * commonest:.0f} %, the duration alone in {100 * by_duration:.0f} %."
         )
     return why
 
 
-def known_parts(judged: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the parts of a rated task's rating that are predicted better than by chance.
+def known_parts(judged: TaskValidation) -> tuple[str, ...]:
+    """Return the parts of a rated task's rating that are predicted better than by chance, by their names.
 
     Args:
-        judged: As for `refusals`, of a task and not of the mean.
-
-    Returns:
-        The names of the parts.
+        judged: The model judged on a task, and not on the mean of several.
     """
-    by_chance, lows = judged["chance"]["rho"], {name: part["rho_interval"][0] for name, part in judged["parts"].items()}
-    return tuple(name for name, low in lows.items() if low > 0 and low > by_chance)
+    lows = {name: part.rho_interval[0] for name, part in judged.parts.items()}
+    return tuple(name for name, low in lows.items() if low > 0 and low > judged.chance.rho)
 
 
-def _in_words(p: float, chance: Mapping[str, Any]) -> str:
-    """Return a p-value above `ACCEPTED_P` in words, and whether it may be above it for want of permutations."""
-    said, permutations = f"p = {p:.3f}; at most {ACCEPTED_P} is accepted", chance.get("permutations")
-    if permutations is None or np.isnan(p):
+def _describe_p(p: float, chance: Chance) -> str:
+    """Describe a p-value above `ACCEPTED_P`, and whether it may be above it for want of permutations."""
+    said = f"p = {p:.3f}; at most {ACCEPTED_P} is accepted"
+    if np.isnan(p):
         return said
-    as_good = round(p * (permutations + 1)) - 1
-    low, high = wilson(as_good, permutations)
+    low, high = wilson(round(p * (chance.permutations + 1)) - 1, chance.permutations)
     if low > ACCEPTED_P:
         return said
     return (
-        f"{said}; it may be {low:.3f} to {high:.3f}, because {permutations} permutations are few: calibrate again with "
-        "more"
+        f"{said}; it may be {low:.3f} to {high:.3f}, because {chance.permutations} permutations are few: calibrate "
+        "again with more"
     )

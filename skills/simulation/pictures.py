@@ -25,9 +25,9 @@ from PIL import Image, ImageDraw, ImageFont
 from skills.arrays import Flags, Floats, Ints
 from skills.kinematics import JOINTS, UNITS, instrument_of, matrix_of
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
-from skills.planning.trajectory import Trajectory
+from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
 from skills.verification.bodies import distances_at, names_of, parts_of, radii_of
-from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_A, PSM_M, LinkPair, Playback
+from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, LinkPair, Playback
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

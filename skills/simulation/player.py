@@ -83,7 +83,7 @@ def default_pad_top(trajectory: Trajectory) -> float:
     lowest = _lowest_finger(trajectory.tip_mm, matrix_of(trajectory.rotation_xyzw))
     if trajectory.psm_m is not None:
         lowest = min(lowest, _lowest_finger(*psm_m_poses(trajectory, np.arange(len(trajectory)))))
-    opened = float(openings(trajectory).max()) - HOLDING_RAD
+    opened = float(openings(trajectory.arms[0]).max()) - HOLDING_RAD
     return lowest - PAD_BELOW_MM - FINGER_REACH_MM * opened  # as far as the gates allow for it
 
 

@@ -48,7 +48,7 @@ from skills.planning.trajectory import A2, Trajectory
 from skills.quaternions import vector_of
 from skills.sandbox import ProcessLimits
 from skills.simulation.player import array_from, simulated
-from skills.verification.arm_errors import ArmErrors, Displaced, Drawn, draw
+from skills.verification.arm_errors import ArmErrors
 from skills.verification.clearance import (
     ASIDE_MM,
     FINGER_RADIUS_MM,
@@ -60,6 +60,7 @@ from skills.verification.clearance import (
     psm_m_poses,
     stands_from,
 )
+from skills.verification.error_draws import Displaced, Drawn, draw
 from skills.verification.monte_carlo import at_hand_off, caught_by, scene_of
 from skills.verification.probabilities import DoubtSettings, Probability, share
 

@@ -37,10 +37,10 @@ from skills.arrays import Floats, Ints
 from skills.errors import SimulationFailed
 from skills.kinematics import INSERTION, JOINTS, InstrumentConstants, instrument_of, matrix_of
 from skills.planning.handoff import HELD_MM, HOLDING_RAD, OPEN_RAD
-from skills.planning.trajectory import A1
+from skills.planning.trajectory import A1, PSM_A, PSM_M
 from skills.simulation import pictures
 from skills.verification.clearance import Bounds
-from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, PSM_A, PSM_M, link_pairs, pad_scale
+from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, link_pairs, pad_scale
 
 MM = 1e-3
 PLACE, TURN = 4, 5  # indices of the frame in a link's state; 0 and 1 would be its centre of mass

@@ -4,7 +4,7 @@
 
 A policy commands centres of cells. Where the error of the tip is more than half a cell along an axis, the arm is in
 another cell than it was sent to, at whatever centre. Slip is the grid world's: with this probability one of the 27
-moves is made, each as likely, which may be the intended one (`skills.learning.slip`). So a share w of moves that end
+moves is made, each as likely, which may be the intended one (`skills.gridworld.slip`). So a share w of moves that end
 elsewhere is a slip of 27/26 w. Errors last from sample to sample: the interval is that of as many samples as are
 independent along the axis with the fewest.
 
@@ -17,14 +17,13 @@ from math import isfinite
 
 import numpy as np
 
+from skills.arithmetic import wilson
 from skills.arrays import Floats
 from skills.errors import BadInput, BadSettings
 from skills.fields import Count, Fraction, schema
-from skills.gridworld.grid import MOVES
-from skills.learning.slip import wilson
-from skills.verification.arm_errors import MeasuredArm, effective_number, encoder_errors_mm, tracked_errors_mm
+from skills.gridworld.slip import slip_of_elsewhere
+from skills.verification.arm_calibration import MeasuredArm, effective_number, encoder_errors_mm, tracked_errors_mm
 
-ELSEWHERE = len(MOVES) / (len(MOVES) - 1)  # slip for each move that ends elsewhere
 MOST_SLIP = 0.9  # ours: with more, the intended move is hardly more likely than another
 
 
@@ -86,8 +85,9 @@ def measure_slip(measured: MeasuredArm, cell_mm: float) -> MeasuredSlip:
     errors_mm = encoder_errors_mm(measured)
     elsewhere = _beyond(errors_mm, cell_mm)
     effective = min(effective_number(axis) for axis in errors_mm.T)
-    low, high = (min(1.0, ELSEWHERE * end) for end in wilson(elsewhere * effective, effective))
-    if not elsewhere * ELSEWHERE <= MOST_SLIP:
+    low, high = (min(1.0, slip_of_elsewhere(end)) for end in wilson(elsewhere * effective, effective))
+    slip = slip_of_elsewhere(elsewhere)
+    if not slip <= MOST_SLIP:
         raise BadInput(
             f"In cells of {cell_mm:g} mm the arm was in another cell than it was sent to at {elsewhere:.0%} of the "
             "samples; such cells cannot be commanded. Measure larger ones.",
@@ -99,7 +99,7 @@ def measure_slip(measured: MeasuredArm, cell_mm: float) -> MeasuredSlip:
         samples=len(errors_mm),
         effective=effective,
         elsewhere=elsewhere,
-        slip=elsewhere * ELSEWHERE,
+        slip=slip,
         interval=(low, high),
         tip_elsewhere=None if measured.marker_mm is None else _beyond(tracked_errors_mm(measured), cell_mm),
     )

@@ -1,6 +1,6 @@
 """The arms' outer bodies: what of two arms may run into each other outside of the patient, in closed form.
 
-    joints --parts_of--> Parts: the axes of every body of an arm
+    joints --parts_of--> Links: the axes of every body of an arm
     two of them --between--> mm per pair
     Trajectory --bodies_clearance--> BodiesReport, and the least distance at every sample
     two arms as planned, variations --too_near--> which variations are
@@ -34,18 +34,17 @@ moment of inertia shows it, such as with cables and drapes.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
-from typing import Protocol
 
 import numpy as np
 
 from skills.arrays import Flags, Floats, Ints
 from skills.fields import Count, Figure, schema
-from skills.kinematics import CLASSIC, INSERTION, SI, WRIST_MM, axes_of, instrument_of, matrix_of
-from skills.planning.motion_laws import PHASES
-from skills.planning.trajectory import Trajectory
-from skills.verification.arm_errors import Displaced
-from skills.verification.clearance import FINGER_REACH_MM, SHAFT_RADIUS_MM
-from skills.verification.playback import CLEARANCE_SEEN_MM, PSM_A, PSM_M
+from skills.gridworld.scene import segments_apart
+from skills.kinematics import CLASSIC, INSERTION, SI, WRIST_MM, axes_of, instrument_of
+from skills.planning.trajectory import PSM_A, PSM_M, PlannedArm, SampleMoment, Trajectory
+from skills.verification.clearance import FINGER_REACH_MM, SHAFT_RADIUS_MM, Links, way_mm
+from skills.verification.error_draws import Displaced
+from skills.verification.playback import CLEARANCE_SEEN_MM
 
 MARGIN_MM = 10.0  # ours: what each radius below is larger than the outline that it stands for, where one is known
 LOOK_MM = 10.0  # ours: distances are computed at samples between which no two bodies approach by more
@@ -145,19 +144,7 @@ def _of(instrument: str) -> tuple[ArmCapsule, ...]:
     return BODIES[instrument_of(instrument).arm.name]
 
 
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """The parts of an arm in T poses: both ends of their axes in mm, in any one frame, both of shape (T, B, 3)."""
-
-    begin_mm: Floats
-    end_mm: Floats
-
-    def seen_from(self, base: Floats, base_mm: Floats) -> "Parts":
-        """Return the parts in a frame where their own is at `base_mm`, shape (3,), turned by `base`, (3, 3)."""
-        return Parts(self.begin_mm @ base.T + base_mm, self.end_mm @ base.T + base_mm)
-
-
-def parts_of(joints: Floats, instrument: str) -> Parts:
+def parts_of(joints: Floats, instrument: str) -> Links:
     """Return the parts of an arm with these joints, in its base frame.
 
     Args:
@@ -180,7 +167,7 @@ def parts_of(joints: Floats, instrument: str) -> Parts:
     shaft, hand, _ = axes_of(joints)
     wrist = (slid - tool.wrist_offset_mm) * shaft
     begin = np.concatenate([ends[0], np.stack([wrist - tool.shaft_mm * shaft, wrist], axis=1)], axis=1)
-    return Parts(begin, np.concatenate([ends[1], np.stack([wrist, wrist + WRIST_MM * hand], axis=1)], axis=1))
+    return Links(begin, np.concatenate([ends[1], np.stack([wrist, wrist + WRIST_MM * hand], axis=1)], axis=1))
 
 
 def moved_mm(joints: Floats, to: Floats, instrument: str) -> Floats:
@@ -217,7 +204,7 @@ def _reach(body: ArmCapsule, insertion_mm: float) -> Row:
     return wide, 0.0 if swung == 0 else swung + (0.0 if parallel else body.radius_mm), float(body.slides)
 
 
-def between(arm: Parts, radii: Floats, other: Parts, other_radii: Floats) -> Floats:
+def between(arm: Links, radii: Floats, other: Links, other_radii: Floats) -> Floats:
     """Return the distances of all parts of one arm from all of another in as many poses, in one frame.
 
     Args:
@@ -240,56 +227,23 @@ def between(arm: Parts, radii: Floats, other: Parts, other_radii: Floats) -> Flo
     return apart
 
 
-def segments_apart(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
-    """Return the distances of segments p + s u from segments q + t v, with s and t in 0..1.
-
-    The least distance is between the lines if they are nearest within both segments, and otherwise at an end of one of
-    them: the s that is best for the lines is brought within the segment, then the t that is best for it, then s again.
-    Where the segments are nearly parallel this is exact too, because every s is then nearly as good. NaN stays NaN.
-
-    Args:
-        p: Beginnings of the first segments, shape (..., 3).
-        u: From their beginnings to their ends, same unit, shape (..., 3).
-        q: Beginnings of the other segments, same frame, shape (..., 3).
-        v: From their beginnings to their ends, shape (..., 3).
-
-    Returns:
-        Distances of the axes in the same unit, shape (...,); shapes are broadcast.
-    """
-    r = p - q
-    uu, vv, uv, ur, vr = ((a * b).sum(axis=-1) for a, b in ((u, u), (v, v), (u, v), (u, r), (v, r)))
-    uu, vv = np.maximum(uu, 1e-12), np.maximum(vv, 1e-12)  # an axis without length is a point
-    s = np.clip((uv * vr - ur * vv) / np.maximum(uu * vv - uv * uv, 1e-12 * uu * vv), 0.0, 1.0)
-    t = np.clip((uv * s + vr) / vv, 0.0, 1.0)
-    s = np.clip((uv * t - ur) / uu, 0.0, 1.0)
-    return np.asarray(np.sqrt(np.square(r + s[..., None] * u - t[..., None] * v).sum(axis=-1)))
-
-
 # ---- along a motion ------------------------------------------------------------------------------------------------
 
 
 @schema
-@dataclass(frozen=True)
-class NearestBodies:
-    """The least distance between a part of PSM_A and one of PSM_M.
+@dataclass(frozen=True, kw_only=True)
+class NearestBodies(SampleMoment):
+    """The least distance between a part of PSM_A and one of PSM_M, and the sample of it.
 
     Attributes:
         part: The part of PSM_A.
         other: The part of PSM_M.
         least_mm: The distance; negative where they overlap.
-        sample: The sample.
-        pass_index: Its pass.
-        phase: The name of its phase.
-        stamp_s: Its time.
     """
 
     part: str
     other: str
     least_mm: Figure
-    sample: Count
-    pass_index: Count
-    phase: str
-    stamp_s: float
 
     def __str__(self) -> str:
         """Return the names of both."""
@@ -343,15 +297,12 @@ def bodies_clearance(trajectory: Trajectory, limit_mm: float) -> BodiesClearance
         so nothing is missed between them; where that falls below the limit, all samples are looked at, up to the first
         at which it is broken.
     """
-    m, count = trajectory.psm_m, len(trajectory)
-    arms = [instrument_of(one).arm.name for one in (trajectory.instrument, *([] if m is None else [m.instrument]))]
-    if m is None:
-        alone = BodiesReport(tuple(arms), limit_mm, None, CLEARANCE_SEEN_MM, 0, ())
+    arms, count = trajectory.arms, len(trajectory)
+    names = tuple(instrument_of(arm.instrument).arm.name for arm in arms)
+    if len(arms) == 1:
+        alone = BodiesReport(names, limit_mm, None, CLEARANCE_SEEN_MM, 0, ())
         return BodiesClearance(alone, np.full(count, np.inf), None)
-    ways = [
-        np.concatenate([np.zeros((1, len(names_of(tool)))), np.cumsum(moved_mm(q[:-1], q[1:], tool), axis=0)])
-        for q, tool in ((trajectory.joints, trajectory.instrument), (m.joints, m.instrument))
-    ]
+    ways = [way_mm(moved_mm(arm.joints[:-1], arm.joints[1:], arm.instrument)) for arm in arms]
     looks = _looks(ways)
     seen = distances_at(trajectory, looks)
     while True:
@@ -375,7 +326,7 @@ def bodies_clearance(trajectory: Trajectory, limit_mm: float) -> BodiesClearance
         here = seen[look] if not seen[look].min() >= limit_mm else np.minimum(seen[look], seen[look + 1])
         first = _nearest(trajectory, looks[look], here)
     report = BodiesReport(
-        arms=tuple(arms),
+        arms=names,
         limit_mm=limit_mm,
         at_least_mm=float(bound.min()),
         seen_within_mm=CLEARANCE_SEEN_MM,
@@ -402,13 +353,11 @@ def distances_at(trajectory: Trajectory, at: Ints) -> Floats:
     Returns:
         Distances in mm, as of `between`, shape (C, B, B').
     """
-    m = trajectory.psm_m
-    assert m is not None
-    base, found = matrix_of(m.base_xyzw[None])[0], []
-    radii, other_radii = radii_of(trajectory.instrument), radii_of(m.instrument)
+    arms, found = trajectory.arms, []
+    radii = [radii_of(arm.instrument) for arm in arms]
     for some in np.array_split(at, 1 + len(at) // _CHUNK):
-        other = parts_of(m.joints[some], m.instrument).seen_from(base, m.base_mm)
-        found.append(between(parts_of(trajectory.joints[some], trajectory.instrument), radii, other, other_radii))
+        arm, other = (parts_of(one.joints[some], one.instrument).seen_from(one.base, one.base_mm) for one in arms)
+        found.append(between(arm, radii[0], other, radii[1]))
     return np.concatenate(found)
 
 
@@ -421,61 +370,29 @@ def _until_next(seen: Floats, ways: list[Floats]) -> Floats:
 
 def _nearest(trajectory: Trajectory, sample: int, apart: Floats) -> NearestBodies:
     """Return the pair with the least of some distances, (B, B'); NaN is the least of all."""
-    m = trajectory.psm_m
-    assert m is not None
     part, other = np.unravel_index(int(np.nan_to_num(apart, nan=-np.inf).argmin()), apart.shape)
-    return _named(trajectory, m.instrument, int(sample), int(part), int(other), float(apart[part, other]))
+    return _named(trajectory, sample, int(part), int(other), float(apart[part, other]))
 
 
-def _named(trajectory: Trajectory, other: str, sample: int, part: int, second: int, least_mm: float) -> NearestBodies:
-    return NearestBodies(
-        part=names_of(trajectory.instrument)[part],
-        other=names_of(other)[second],
-        least_mm=least_mm,
-        sample=sample,
-        pass_index=int(trajectory.pass_index[sample]),
-        phase=PHASES[trajectory.phase[sample]],
-        stamp_s=float(trajectory.stamps_s[sample]),
-    )
+def _named(trajectory: Trajectory, sample: int, part: int, other: int, least_mm: float) -> NearestBodies:
+    names = [names_of(arm.instrument) for arm in trajectory.arms]
+    moment = vars(trajectory.moment(sample))
+    return NearestBodies(part=names[0][part], other=names[1][other], least_mm=least_mm, **moment)
 
 
 def _all_nearest(trajectory: Trajectory, looks: Ints, seen: Floats) -> tuple[NearestBodies, ...]:
-    m = trajectory.psm_m
-    assert m is not None
     known = np.nan_to_num(seen, nan=-np.inf, posinf=np.inf, neginf=-np.inf)
     least, at = known.min(axis=0), known.argmin(axis=0)
     pairs = [(int(i), int(j)) for i, j in np.argwhere(least < CLEARANCE_SEEN_MM)]
     pairs.sort(key=lambda pair: float(least[pair]))
-    return tuple(
-        _named(trajectory, m.instrument, int(looks[at[i, j]]), i, j, float(seen[at[i, j], i, j])) for i, j in pairs
-    )
+    return tuple(_named(trajectory, int(looks[at[i, j]]), i, j, float(seen[at[i, j], i, j])) for i, j in pairs)
 
 
 # ---- in many inexact worlds ----------------------------------------------------------------------------------------
 
 
-class Placed(Protocol):
-    """An arm as planned in S samples, as `monte_carlo.Planned` is."""
-
-    @property
-    def joints(self) -> Floats:
-        """Its joints, rad and mm, shape (S, 6)."""
-
-    @property
-    def instrument(self) -> str:
-        """Number of its instrument."""
-
-    @property
-    def base(self) -> Floats:
-        """Rotation of its base in PSM_A's base frame, shape (3, 3)."""
-
-    @property
-    def base_mm(self) -> Floats:
-        """Its remote centre there, shape (3,)."""
-
-
 def too_near(
-    arms: tuple[Placed, ...],
+    arms: Sequence[PlannedArm],
     joints: list[Floats],
     displaced: Sequence[Displaced],
     limit_mm: float,
@@ -529,11 +446,11 @@ def too_near(
     return wrong
 
 
-def _placed(arm: Placed, joints: Floats) -> Parts:
+def _placed(arm: PlannedArm, joints: Floats) -> Links:
     return parts_of(joints, arm.instrument).seen_from(arm.base, arm.base_mm)
 
 
-def _axes(arm: Placed, joints: Floats, rows: Ints, parts: Ints) -> tuple[Floats, Floats]:
+def _axes(arm: PlannedArm, joints: Floats, rows: Ints, parts: Ints) -> tuple[Floats, Floats]:
     """Return beginning and direction of some parts in some poses, both of shape (K, 3)."""
     used, index = np.unique(rows, return_inverse=True)
     placed = _placed(arm, joints[used])

@@ -41,11 +41,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arrays import Flags, Floats, Ints
-from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, JAW_TIP_MM, WRIST_MM, forward, instrument_of, matrix_of
-from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_FREE_RAD, NEEDLE_RADIUS_MM, OtherArm
-from skills.planning.trajectory import TRANSFER, Trajectory
+from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, JAW_TIP_MM, WRIST_MM, axes_of, instrument_of, matrix_of
+from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_FREE_RAD, NEEDLE_RADIUS_MM
+from skills.planning.trajectory import PSM_A, TRANSFER, PlannedArm, Trajectory
 from skills.verification.playback import FINGERS as FINGER_LINKS
-from skills.verification.playback import LINKS, PAD_SIZE_MM, PSM_A, LinkPair, pad_scale
+from skills.verification.playback import LINKS, PAD_SIZE_MM, LinkPair, pad_scale
 
 # The reach of the surfaces in `urdf/psm.urdf` from the wrist's pitch axis and from the hinge, mm.
 SHAFT_RADIUS_MM = 4.0
@@ -83,11 +83,20 @@ def travel_mm(joints: Floats, instrument: str) -> Floats:
     return np.stack([shaft, wrists, fingers, fingers], axis=1)
 
 
-def openings(arm: Trajectory | OtherArm, unplanned_rad: float = HOLDING_RAD) -> Floats:
+def way_mm(steps_mm: Floats) -> Floats:
+    """Return the distances moved since the first sample, shape (T, L).
+
+    Args:
+        steps_mm: Those from each sample to the next, shape (T - 1, L).
+    """
+    return np.concatenate([np.zeros((1, steps_mm.shape[1])), np.cumsum(steps_mm, axis=0)])
+
+
+def openings(arm: PlannedArm, unplanned_rad: float = HOLDING_RAD) -> Floats:
     """Return the opening of each of an arm's fingers, rad, shape (T,): at least that of jaws that hold a needle.
 
     Args:
-        arm: The motion: of PSM_A, or of PSM_M.
+        arm: The motion of the arm.
         unplanned_rad: The opening where the motion states no angle of the jaw.
     """
     if arm.jaw_rad is None:
@@ -102,9 +111,9 @@ def stands_from(trajectory: Trajectory, end: int) -> int:
         trajectory: The motion.
         end: The index of a sample; NaN stands nowhere else.
     """
-    moved = ~(np.abs(trajectory.joints[: end + 1] - trajectory.joints[end]) <= STANDS).all(axis=1)
-    if trajectory.psm_m is not None:
-        moved |= ~(np.abs(trajectory.psm_m.joints[: end + 1] - trajectory.psm_m.joints[end]) <= STANDS).all(axis=1)
+    moved = np.zeros(end + 1, bool)
+    for arm in trajectory.arms:
+        moved |= ~(np.abs(arm.joints[: end + 1] - arm.joints[end]) <= STANDS).all(axis=1)
     moved[end] = False
     return end - int(np.argmax(np.append(moved[::-1], True))) + 1
 
@@ -141,10 +150,7 @@ class Bounds:
             looked_at: The samples of the measurements, ascending, with the first and the last of all, shape (C,).
             seen_mm: The distances measured there, shape (C, P).
         """
-        ways = {
-            name: np.concatenate([np.zeros((1, len(LINKS))), np.cumsum(travel_mm(joints, tool), axis=0)])
-            for name, (joints, tool) in moving.items()
-        }
+        ways = {name: way_mm(travel_mm(joints, tool)) for name, (joints, tool) in moving.items()}
         return cls(tuple(pairs), looked_at, seen_mm, ways)
 
     def at_least_mm(self, column: int) -> Floats:
@@ -188,7 +194,7 @@ _PARALLEL = 1e-12  # part of the product of two squared lengths: segments are th
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """The links of an arm in T poses: both ends of their axes, mm in any one frame, both of shape (T, 4, 3)."""
+    """Links of an arm, or other parts of it, in T poses: both ends of their L axes, mm in any one frame, (T, L, 3)."""
 
     begin_mm: Floats
     end_mm: Floats
@@ -212,17 +218,10 @@ def links_of(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT, opening_ra
     """
     tool = instrument_of(instrument)
     q = np.asarray(joints, dtype=np.float64)
-    (s1, s2, s4, s5, s6), (c1, c2, c4, c5, c6) = (f(q[:, (0, 1, 3, 4, 5)]).T[:, :, None] for f in (np.sin, np.cos))
-    # The axes of the Denavit-Hartenberg frames, as the inverse of `kinematics` has them.
-    shaft = np.concatenate([c2 * s1, -s2, -c2 * c1], axis=1)
-    x3 = np.concatenate([-s1 * s2, -c2, c1 * s2], axis=1)
-    y3 = np.cross(shaft, x3)
-    z5 = c4 * y3 - s4 * x3
-    x5 = s5 * (c4 * x3 + s4 * y3) + c5 * shaft
-    o = -s6 * x5 - c6 * z5
-    a = np.cross(o, np.cross(z5, x5))
+    shaft, along, rotation = axes_of(q)
+    o, a = rotation[:, :, 1], rotation[:, :, 2]
     wrist = (q[:, 2:3] - tool.wrist_offset_mm) * shaft
-    hinge = wrist + WRIST_MM * x5
+    hinge = wrist + WRIST_MM * along
     axes = [(wrist - tool.shaft_mm * shaft, wrist), (wrist, hinge)]
     opening = np.broadcast_to(np.asarray(opening_rad, dtype=np.float64), (len(q),))[:, None]
     cosine, sine = np.cos(opening), np.sin(opening)
@@ -374,11 +373,8 @@ def psm_m_poses(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
     Returns:
         PSM_M's tip, mm, shape (F, 3), and its rotation [n o a], shape (F, 3, 3).
     """
-    psm_m = trajectory.psm_m
-    assert psm_m is not None
-    tip_mm, rotation = forward(psm_m.joints[at], psm_m.instrument)
-    base = matrix_of(psm_m.base_xyzw[None])[0]
-    return tip_mm @ base.T + psm_m.base_mm, base @ rotation
+    poses = trajectory.arms[1].poses(at)
+    return poses.tip_mm, poses.rotation
 
 
 def _in_jaws_of_psm_a(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:

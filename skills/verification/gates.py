@@ -26,7 +26,7 @@ from skills.kinematics import (
 )
 from skills.planning.handoff import HOLDING_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
-from skills.planning.trajectory import Trajectory, joint_ratios
+from skills.planning.trajectory import PSM_A, PSM_M, Trajectory, joint_ratios
 from skills.verification.bodies import BodiesClearance
 from skills.verification.clearance import (
     FINGER_REACH_MM,
@@ -36,8 +36,8 @@ from skills.verification.clearance import (
     psm_m_poses,
     stands_from,
 )
-from skills.verification.intent import LIMITS, IntentComparison
-from skills.verification.playback import PAD, PSM_A, PSM_M, Playback
+from skills.verification.deviations import LIMITS, Deviations
+from skills.verification.playback import PAD, Playback
 from skills.verification.scene_clearance import SceneClearance
 
 TOLERANCE = 1e-9  # in the unit of a figure: two processors differ by less, so both accept or one is too strict
@@ -99,9 +99,7 @@ def figures_of(playback: Playback, trajectory: Trajectory) -> Figures:
     if m is not None and playback.psm_m_tip_mm is not None:
         arms.append(_arm(PSM_M, m.joints, m.instrument, trajectory.rate_hz))
         psm_m_fk_mm[looked_at] = np.linalg.norm(playback.psm_m_tip_mm - psm_m_poses(trajectory, looked_at)[0], axis=1)
-    moving = {PSM_A: (trajectory.joints, trajectory.instrument)}
-    if m is not None:
-        moving[PSM_M] = (m.joints, m.instrument)
+    moving = {arm.name: (arm.joints, arm.instrument) for arm in trajectory.arms}
     return Figures(
         arms=tuple(arms),
         fk_mm=np.linalg.norm(playback.tip_mm - trajectory.tip_mm, axis=1),
@@ -111,7 +109,8 @@ def figures_of(playback: Playback, trajectory: Trajectory) -> Figures:
         effort=(np.abs(playback.efforts) / np.array(instrument_of(trajectory.instrument).arm.effort)).max(axis=1),
         apart=replace(
             Bounds.of(moving, playback.link_pairs, looked_at, playback.clearances_mm),
-            opened_mm=FINGER_REACH_MM * (openings(trajectory) - HOLDING_RAD),  # the simulator's fingers hold a needle
+            # the simulator's fingers hold a needle
+            opened_mm=FINGER_REACH_MM * (openings(trajectory.arms[0]) - HOLDING_RAD),
         ),
         needle_mm=needle_to_pad_mm(trajectory, looked_at, playback.pad_mm),
     )
@@ -226,7 +225,7 @@ def first_failure(
     limits: Limits,
     beside: SceneClearance | None = None,
     outer: BodiesClearance | None = None,
-    intent: IntentComparison | None = None,
+    intent: Deviations | None = None,
 ) -> Failure | None:
     """Return the earliest sample at which a gate is broken; of several gates broken there, the first listed.
 

@@ -51,13 +51,12 @@ from skills.kinematics import (
     forward,
     instrument_of,
     joint_margins,
-    matrix_of,
     solutions_of,
 )
-from skills.planning.handoff import HELD_MM, hand_off
+from skills.planning.handoff import HELD_MM, HOLDING_RAD, hand_off
 from skills.planning.motion_laws import Pose
-from skills.planning.trajectory import A2, Trajectory
-from skills.verification.arm_errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors, Displaced, Drawn, draw
+from skills.planning.trajectory import A2, PSM_M, PlannedArm, Trajectory
+from skills.verification.arm_errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors
 from skills.verification.bodies import too_near
 from skills.verification.clearance import (
     FINGER_REACH_MM,
@@ -72,6 +71,7 @@ from skills.verification.clearance import (
     openings,
     travel_mm,
 )
+from skills.verification.error_draws import Displaced, Drawn, draw
 from skills.verification.gates import Limits
 from skills.verification.probabilities import (
     AT_THE_END,
@@ -90,26 +90,18 @@ _STILL_MM = 1e-6  # with less total travel, a pass is one stretch
 _ROUND_OFF = 1e-9  # as in `kinematics`: a joint on its limit is within it
 
 
-@dataclass(frozen=True, eq=False)
-class Planned:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Planned(PlannedArm):
     """One arm as planned in S samples.
 
     Attributes:
         tip_mm: Its tip in its base frame, shape (S, 3).
         rotation: Its rotation [n o a] there, shape (S, 3, 3).
-        joints: Its joints, rad and mm, shape (S, 6).
-        instrument: Number of its instrument.
-        base: Rotation of its base in PSM_A's base frame, shape (3, 3).
-        base_mm: Its remote centre there, shape (3,).
         opening_rad: Opening of each of its fingers, shape (S,).
     """
 
     tip_mm: Floats
     rotation: Floats
-    joints: Floats
-    instrument: str
-    base: Floats
-    base_mm: Floats
     opening_rad: Floats
 
     def at(self, samples: Ints) -> "Planned":
@@ -135,7 +127,7 @@ class Planned:
         openings_rad = np.tile(self.opening_rad, len(joints) // len(self.opening_rad))
         return links_of(joints, self.instrument, openings_rad).seen_from(self.base, self.base_mm)
 
-    def poses(self, joints: Floats) -> tuple[Floats, Floats]:
+    def poses_of(self, joints: Floats) -> tuple[Floats, Floats]:
         """Return the tips, (T, 3), and rotations [n o a], (T, 3, 3), of joints in PSM_A's base frame; NaN stays NaN."""
         shaft, wrist, rotation = axes_of(joints)
         depth_mm = joints[:, INSERTION] - instrument_of(self.instrument).wrist_offset_mm
@@ -193,14 +185,12 @@ def scene_of(
         pad_normal: Unit direction out of the pad.
     """
     samples = np.flatnonzero(trajectory.pass_index == number)
-    rotation = matrix_of(trajectory.rotation_xyzw[samples])
-    tip, joints, instrument = trajectory.tip_mm[samples], trajectory.joints[samples], trajectory.instrument
-    arms = [Planned(tip, rotation, joints, instrument, np.eye(3), np.zeros(3), openings(trajectory)[samples])]
-    other = trajectory.psm_m
-    if other is not None:
-        joints, base = other.joints[samples], matrix_of(other.base_xyzw[None])[0]
-        opened = openings(other, opening_rad)[samples]
-        arms.append(Planned(*forward(joints, other.instrument), joints, other.instrument, base, other.base_mm, opened))
+    arms = []
+    for arm, unplanned_rad in zip(trajectory.arms, (HOLDING_RAD, opening_rad), strict=False):
+        joints, opened = arm.joints[samples], openings(arm, unplanned_rad)[samples]
+        tip_mm, rotation = forward(joints, arm.instrument)
+        planned = vars(arm) | {"joints": joints, "jaw_rad": None}
+        arms.append(Planned(tip_mm=tip_mm, rotation=rotation, opening_rad=opened, **planned))
     recorded = trajectory.taking
     taking = None if recorded is None else Pose(recorded.tip_mm[number], recorded.rotation[number])
     phase, stamps_s = trajectory.phase[samples], trajectory.stamps_s[samples]
@@ -506,8 +496,17 @@ def at_hand_off(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: floa
     joints[:, INSERTION] = depth_mm + instrument_of(DEFAULT_INSTRUMENT).wrist_offset_mm - WRIST_MM
     (own_tip,), (own_jaw,) = forward(joints)
     base = jaw @ own_jaw.T
-    mine = (own_tip[None], own_jaw[None], joints, DEFAULT_INSTRUMENT, base, tip - base @ own_tip)
-    return arm, Planned(*mine, opening_rad=np.zeros(1))
+    return arm, Planned(
+        name=PSM_M,
+        instrument=DEFAULT_INSTRUMENT,
+        joints=joints,
+        jaw_rad=None,
+        base=base,
+        base_mm=tip - base @ own_tip,
+        tip_mm=own_tip[None],
+        rotation=own_jaw[None],
+        opening_rad=np.zeros(1),
+    )
 
 
 def caught_by(
@@ -524,9 +523,9 @@ def caught_by(
 
     `catch` has PSM_M's jaws as planned, so PSM_A is taken to where it is relative to them.
     """
-    (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses(arm.joints) for arm in arms)
+    (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses_of(arm.joints) for arm in arms)
     planned = HandOff(tip_a[0], jaw_a[0], tip_m[0], jaw_m[0])
-    (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses(arm.shifted(shift_mm)) for arm in arms)
+    (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses_of(arm.shifted(shift_mm)) for arm in arms)
     jaw_a, jaw_m, centre = errors.jaw_turn[0] @ jaw_a, errors.jaw_turn[1] @ jaw_m, arms[1].base_mm
     tip_m = np.einsum("nij,nj->ni", errors.base_turn, tip_m - centre) + centre + errors.base_mm
     back = planned.jaw_m @ np.swapaxes(errors.base_turn @ jaw_m, 1, 2)  # from PSM_M's jaws as they are to the planned

@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput
-from skills.planning.trajectory import Trajectory
+from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
 
 CLEARANCE_SEEN_MM = 50.0  # surfaces further apart than this are reported as this far
-PSM_A, PSM_M, PAD = "PSM_A", "PSM_M", "pad"
+PAD = "pad"
 LINKS = ("roll_link", "wrist_pitch_link", "finger_1", "finger_2")  # the links of `urdf/psm.urdf` that have a surface
 FINGERS = ("finger_1", "finger_2")
 PAD_SIZE_MM = (120.0, 120.0, 12.0)  # of `urdf/suture_pad.urdf`, whose frame is the middle of its top

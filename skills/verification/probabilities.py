@@ -11,10 +11,10 @@ from math import isfinite, radians
 
 import numpy as np
 
+from skills.arithmetic import wilson
 from skills.arrays import Flags
 from skills.errors import BadSettings
 from skills.fields import Count, Figure, Fraction, Point, schema
-from skills.learning.slip import wilson
 from skills.planning.handoff import OPEN_RAD
 from skills.verification.arm_errors import ArmErrors
 from skills.verification.gates import Limits

@@ -42,7 +42,7 @@ from skills.kinematics import (
 from skills.planning.handoff import HOLDING_RAD, OtherArm
 from skills.planning.motion_laws import Poses
 from skills.planning.plan import Pass, SuturePlan
-from skills.planning.trajectory import PassPoses, Trajectory, poses_along
+from skills.planning.trajectory import PSM_A, PSM_M, PassPoses, Trajectory, poses_along
 from skills.verification.bodies import distances_at, moved_mm
 from skills.verification.clearance import (
     FINGER_REACH_MM,
@@ -54,7 +54,6 @@ from skills.verification.clearance import (
     travel_mm,
 )
 from skills.verification.gates import Limits
-from skills.verification.playback import PSM_A, PSM_M
 from skills.verification.scene_clearance import LOOK_MM, TISSUE, from_parts, groups_of, limit_of, needle_from_tissue
 
 MAX_PLACES = 1000
@@ -119,8 +118,8 @@ def map_reach(plan: SuturePlan, positions_mm: Floats, limits: Limits | None = No
     if not 1 <= count <= MAX_PLACES:
         raise BadPlan(f"A map must have 1 to {MAX_PLACES} places: positions times rotations.", places=count)
     found: list[ReachPlace] = []
-    for one, path in zip(plan.passes, plan.pass_paths, strict=True):
-        found += _Moved(plan, one, poses_along(path, plan.psm_m, STEP_MM), positions_mm, limits or Limits()).places()
+    for one in plan.passes:
+        found += _Moved(plan, one, poses_along(one, plan.psm_m, STEP_MM), positions_mm, limits or Limits()).places()
     return found
 
 
@@ -264,31 +263,25 @@ class _Moved:
         )
 
     def _checks(self, motion: Trajectory, looks: "_Looks") -> Iterator[_Check]:
-        m, scene = motion.psm_m, self.plan.scene
-        if m is not None:
-            arms = ((motion.joints, motion.instrument), (m.joints, m.instrument))
+        scene, arms = self.plan.scene, motion.arms
+        if len(arms) == 2:
+            ways = [moved_mm(arm.joints, np.roll(arm.joints, -1, axis=0), arm.instrument) for arm in arms]
             apart = distances_at(motion, looks.rows)
-            ways = [looks.split(moved_mm(q, np.roll(q, -1, axis=0), tool)) for q, tool in arms]
-            way = ways[0][:, :, :, None] + ways[1][:, :, None]
-            yield looks.check("bodies", apart, way, self.limits.clearance_bodies_mm)
-            base = matrix_of(m.base_xyzw[None])[0]
-            links = [links_of(q[looks.rows], tool) for q, tool in arms]
-            apart = clearance_between(links[0], links[1].seen_from(base, m.base_mm))
-            apart[:, FINGERS] -= FINGER_REACH_MM * (openings(motion)[looks.rows, None, None] - HOLDING_RAD)
-            apart.reshape(looks.count, -1, *apart.shape[1:])[:, -1, FINGERS, FINGERS] = (
-                np.inf
-            )  # the needle changes hands
-            ways = [looks.split(_with_last(travel_mm(q, tool))) for q, tool in arms]
-            way = ways[0][:, :, :, None] + ways[1][:, :, None]
-            yield looks.check("tools", apart, way, self.limits.clearance_psm_m_mm)
+            yield looks.check("bodies", apart, looks.of_both(ways), self.limits.clearance_bodies_mm)
+            links = [links_of(arm.joints[looks.rows], arm.instrument).seen_from(arm.base, arm.base_mm) for arm in arms]
+            apart = clearance_between(*links)
+            apart[:, FINGERS] -= FINGER_REACH_MM * (openings(arms[0])[looks.rows, None, None] - HOLDING_RAD)
+            looks.per_place(apart)[:, -1, FINGERS, FINGERS] = np.inf  # the needle changes hands
+            ways = [_with_last(travel_mm(arm.joints, arm.instrument)) for arm in arms]
+            yield looks.check("tools", apart, looks.of_both(ways), self.limits.clearance_psm_m_mm)
         if scene is None:
             return
         found: list[_Check] = []
-        for body, group in groups_of(motion):
+        for arm, group in groups_of(motion):
             way = looks.split(_with_last(np.diff(group.way_mm, axis=0)))
             found += [
                 looks.check("scene", apart, way, limit_of(scene), group.look_mm / 2)
-                for apart in from_parts(group, scene, body, looks.rows).values()
+                for apart in from_parts(group, scene, arm.name, looks.rows).values()
             ]
         if found:
             yield _Check(
@@ -321,6 +314,11 @@ class _Looks:
     def split(self, steps: Floats) -> Floats:
         """Return the ways from each pose to the next, (N * S, B), by place, (N, S - 1, B)."""
         return steps.reshape(self.count, self.samples, -1)[:, :-1]
+
+    def of_both(self, steps: list[Floats]) -> Floats:
+        """Return how far each part of one arm and each of the other can approach, (N, S - 1, B, B')."""
+        one, other = map(self.split, steps)
+        return one[:, :, :, None] + other[:, :, None]
 
     def check(self, name: str, apart: Floats, way: Floats, limit_mm: float, look_mm: float = 0.0) -> _Check:
         """Compare distances with a limit.

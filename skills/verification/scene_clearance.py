@@ -25,14 +25,14 @@ from functools import partial
 from math import nan
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from skills.arrays import Flags, Floats, Ints, xyz
 from skills.fields import Count, Figure, Point, schema
 from skills.gridworld.scene import Scene, Tissue
-from skills.kinematics import matrix_of
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
-from skills.planning.motion_laws import A2, PHASES, TRANSFER
-from skills.planning.trajectory import Trajectory
+from skills.planning.motion_laws import A2, TRANSFER
+from skills.planning.trajectory import PSM_A, PSM_M, PlannedArm, SampleMoment, Trajectory
 from skills.verification.bodies import ABOVE_TISSUE, TOOL, moved_mm, names_of, parts_of, radii_of
 from skills.verification.clearance import (
     ARC_BULGE_MM,
@@ -47,8 +47,9 @@ from skills.verification.clearance import (
     openings,
     psm_m_poses,
     travel_mm,
+    way_mm,
 )
-from skills.verification.playback import CLEARANCE_SEEN_MM, LINKS, PSM_A, PSM_M
+from skills.verification.playback import CLEARANCE_SEEN_MM, LINKS
 
 LEAST_MM = 1.0  # ours, as of the pad: the error of a calibrated arm (0.65 mm) and half as much again
 LOOK_MM = 0.25  # ours: a distance that is judged is at most half of this too small, for that reason
@@ -61,19 +62,15 @@ JAWS_RAD = np.linspace(HOLDING_RAD, OPEN_RAD, 5).tolist()
 
 
 @schema
-@dataclass(frozen=True)
-class NearestToScene:
-    """The least distance of an arm's tool from a part of the scene.
+@dataclass(frozen=True, kw_only=True)
+class NearestToScene(SampleMoment):
+    """The least distance of an arm's tool from a part of the scene, and the sample of it.
 
     Attributes:
         body: The arm, or "needle".
         link: Its link, by its name in the URDF, or its outer body.
         part: tissue, or box or capsule with its index, such as "box 0".
         least_mm: The distance; negative inside.
-        sample: The sample.
-        pass_index: Its pass.
-        phase: The name of its phase.
-        stamp_s: Its time.
         tip_mm: Position of the arm's tip there, in the frame of the plan.
     """
 
@@ -81,10 +78,6 @@ class NearestToScene:
     link: str
     part: str
     least_mm: Figure
-    sample: Count
-    pass_index: Count
-    phase: str
-    stamp_s: float
     tip_mm: Point
 
     def __str__(self) -> str:
@@ -147,23 +140,23 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
     at_least, looked = np.full(len(trajectory), np.inf), np.zeros(len(trajectory), bool)
     limit_mm = limit_of(scene)
     nearest: list[tuple[float, NearestToScene]] = []
-    for body, group in groups_of(trajectory):
-        distances = partial(from_parts, group, scene, body)
+    for arm, group in groups_of(trajectory):
+        distances = partial(from_parts, group, scene, arm.name)
         looks, of_parts = _looked_at(distances, group.way_mm, group.look_mm, limit_mm)
         bounds = [_until_next(apart, group.way_mm[looks]) for apart in of_parts.values()]
         at_least[looks] = np.min([at_least[looks], *bounds], axis=0)
         looked[looks] = True
-        nearest += [_nearest(trajectory, (body, group.names), part, looks, apart) for part, apart in of_parts.items()]
+        nearest += [_nearest(trajectory, arm.name, group.names, part, looks, apart) for part, apart in of_parts.items()]
     needle = np.full(len(trajectory), np.inf)
     if scene.tissue is not None:
-        way = _way(needle_travel_mm(trajectory)[:, None])
+        way = way_mm(needle_travel_mm(trajectory)[:, None])
         begins = np.flatnonzero(np.diff(trajectory.phase) | np.diff(trajectory.pass_index)) + 1
         ends = np.concatenate([begins - 1, begins])
         looks, seen = _looked_at(partial(needle_from_tissue, trajectory, scene.tissue), way, LOOK_MM, 0.0, ends)
         apart = seen[TISSUE]
         needle[looks] = _until_next(apart, way[looks])
         needle[_by_hand(trajectory, needle)] = np.inf
-        nearest.append(_nearest(trajectory, (NEEDLE, (ARC,)), TISSUE, looks, apart))
+        nearest.append(_nearest(trajectory, NEEDLE, (ARC,), TISSUE, looks, apart))
     nearest.sort(key=lambda pair: float(np.nan_to_num(pair[0], nan=-np.inf)))
     least, least_needle = float(at_least.min()), float(needle.min())
     return SceneClearance(
@@ -211,64 +204,46 @@ class Group:
     above_tissue: Flags
 
 
-def groups_of(trajectory: Trajectory) -> list[tuple[str, Group]]:
-    """Return the name of each arm of a motion with its tool, and with its outer bodies.
+def groups_of(trajectory: Trajectory) -> list[tuple[PlannedArm, Group]]:
+    """Return each arm of a motion with its tool, and with its outer bodies.
 
     Args:
         trajectory: The motion of PSM_A, and of PSM_M if it moves.
     """
-    arms = (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,)
-    return [(body, group(trajectory, body)) for body in arms for group in (_tool, _bodies)]
+    return [(arm, group(arm)) for arm in trajectory.arms for group in (_tool, _bodies)]
 
 
-def _tool(trajectory: Trajectory, body: str) -> Group:
-    m = trajectory.psm_m
-    if body == PSM_A or m is None:
-        steps = travel_mm(trajectory.joints, trajectory.instrument)
-        steps[:, FINGERS] += FINGER_REACH_MM * np.abs(np.diff(openings(trajectory)))[:, None]
-    else:
-        steps = travel_mm(m.joints, m.instrument)
-    every = np.ones(len(LINKS), bool)
-    return Group(LINKS, RADII_MM, _way(steps), LOOK_MM, partial(links_at, trajectory, body), every)
+def _tool(arm: PlannedArm) -> Group:
+    steps = travel_mm(arm.joints, arm.instrument)
+    if arm.name == PSM_A:
+        steps[:, FINGERS] += FINGER_REACH_MM * np.abs(np.diff(openings(arm)))[:, None]
+    return Group(LINKS, RADII_MM, way_mm(steps), LOOK_MM, partial(links_at, arm), np.ones(len(LINKS), bool))
 
 
-def _bodies(trajectory: Trajectory, body: str) -> Group:
-    m = trajectory.psm_m
-    mine = body == PSM_A or m is None
-    joints, tool = (trajectory.joints, trajectory.instrument) if mine or m is None else (m.joints, m.instrument)
-    names = names_of(tool)[: -len(TOOL)]
-    way = _way(moved_mm(joints[:-1], joints[1:], tool)[:, : len(names)])
+def _bodies(arm: PlannedArm) -> Group:
+    names = names_of(arm.instrument)[: -len(TOOL)]
+    way = way_mm(moved_mm(arm.joints[:-1], arm.joints[1:], arm.instrument)[:, : len(names)])
 
     def axes(at: Ints) -> tuple[Links, ...]:
-        parts = parts_of(joints[at], tool)
-        links = Links(parts.begin_mm[:, : len(names)], parts.end_mm[:, : len(names)])
-        return (links if mine or m is None else links.seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm),)
+        parts = parts_of(arm.joints[at], arm.instrument).seen_from(arm.base, arm.base_mm)
+        return (Links(parts.begin_mm[:, : len(names)], parts.end_mm[:, : len(names)]),)
 
-    above = np.isin(names, ABOVE_TISSUE)
-    return Group(names, radii_of(tool)[: len(names)], way, LOOK_BODIES_MM, axes, above)
+    radii, above = radii_of(arm.instrument)[: len(names)], np.isin(names, ABOVE_TISSUE)
+    return Group(names, radii, way, LOOK_BODIES_MM, axes, above)
 
 
-def links_at(trajectory: Trajectory, body: str, at: Ints) -> tuple[Links, ...]:
+def links_at(arm: PlannedArm, at: Ints) -> tuple[Links, ...]:
     """Return an arm's links at some samples, in the frame of PSM_A's base; PSM_M's with each opening of its jaw.
 
     Args:
-        trajectory: The motion of PSM_A, and of PSM_M if it moves.
-        body: `PSM_A` or `PSM_M`; without a motion of PSM_M always PSM_A's links are returned.
+        arm: The motion of the arm.
         at: The samples, shape (C,).
 
     Returns:
         The links in C poses, once for PSM_A, and for each of `JAWS_RAD` for PSM_M.
     """
-    m = trajectory.psm_m
-    if body == PSM_A or m is None:
-        return (links_of(trajectory.joints[at], trajectory.instrument, openings(trajectory)[at]),)
-    base = matrix_of(m.base_xyzw[None])[0]
-    return tuple(links_of(m.joints[at], m.instrument, jaw).seen_from(base, m.base_mm) for jaw in JAWS_RAD)
-
-
-def _way(steps_mm: Floats) -> Floats:
-    """Return the distances since the first sample, (T, L), of those from each sample to the next."""
-    return np.concatenate([np.zeros((1, steps_mm.shape[1])), np.cumsum(steps_mm, axis=0)])
+    jaws: list[ArrayLike] = [openings(arm)[at]] if arm.name == PSM_A else [*JAWS_RAD]
+    return tuple(links_of(arm.joints[at], arm.instrument, jaw).seen_from(arm.base, arm.base_mm) for jaw in jaws)
 
 
 def _looks(way_mm: Floats, look_mm: float) -> Ints:
@@ -410,11 +385,10 @@ def flat_tissue(trajectory: Trajectory, report: SceneReport, tissue: Tissue) -> 
     if tissue.flat:
         return float(up @ tissue.at_mm) + tissue.heights_mm[0][0], xyz(up)
     every = np.arange(len(trajectory))
-    arms = (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,)
     lowest = min(
         float((np.minimum(one.begin_mm @ up, one.end_mm @ up) - RADII_MM).min())
-        for body in arms
-        for one in links_at(trajectory, body, every)
+        for arm in trajectory.arms
+        for one in links_at(arm, every)
     )
     apart = [one.least_mm for one in report.nearest if one.part == TISSUE and one.link in LINKS]
     least = np.min([nan if one is None else one for one in apart], initial=CLEARANCE_SEEN_MM)  # NaN stays NaN
@@ -422,21 +396,11 @@ def flat_tissue(trajectory: Trajectory, report: SceneReport, tissue: Tissue) -> 
 
 
 def _nearest(
-    trajectory: Trajectory, whose: tuple[str, tuple[str, ...]], part: str, looks: Ints, apart_mm: Floats
+    trajectory: Trajectory, body: str, names: tuple[str, ...], part: str, looks: Ints, apart_mm: Floats
 ) -> tuple[float, NearestToScene]:
     """Return the least distance of an arm or the needle from a part, NaN before all, and where it is."""
-    body, names = whose
     look, link = np.unravel_index(int(np.nan_to_num(apart_mm, nan=-np.inf).argmin()), apart_mm.shape)
     sample, least = int(looks[look]), float(apart_mm[look, link])
     tip = psm_m_poses(trajectory, looks[look : look + 1])[0][0] if body == PSM_M else trajectory.tip_mm[sample]
-    return least, NearestToScene(
-        body=body,
-        link=names[link],
-        part=part,
-        least_mm=least,
-        sample=sample,
-        pass_index=int(trajectory.pass_index[sample]),
-        phase=PHASES[trajectory.phase[sample]],
-        stamp_s=float(trajectory.stamps_s[sample]),
-        tip_mm=xyz(tip),
-    )
+    moment = vars(trajectory.moment(sample))
+    return least, NearestToScene(body=body, link=names[link], part=part, least_mm=least, tip_mm=xyz(tip), **moment)

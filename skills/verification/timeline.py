@@ -31,13 +31,13 @@ from skills.demonstration.movement import press_times, same_signs, smoothed_spee
 from skills.demonstration.partner import STEADY_MM
 from skills.demonstration.recording import Motion, Recording
 from skills.fields import Column, Count, schema
-from skills.kinematics import INSTRUMENTS, forward, matrix_of, quaternion_of
+from skills.kinematics import INSTRUMENTS, matrix_of, quaternion_of
 from skills.planning.motion_laws import PHASES
-from skills.planning.trajectory import Trajectory
-from skills.verification.bodies import Parts, between, names_of, parts_of, radii_of
-from skills.verification.clearance import FINGER_MM
+from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
+from skills.verification.bodies import between, names_of, parts_of, radii_of
+from skills.verification.clearance import FINGER_MM, Links
 from skills.verification.gates import Limits
-from skills.verification.playback import PSM_A, PSM_M, Playback
+from skills.verification.playback import Playback
 
 if TYPE_CHECKING:  # it imports scipy, which clients that read a timeline do not need
     from skills.learning.pose_style import PosePath
@@ -202,7 +202,7 @@ class _Clock:
         joints: _Samples | None = None,
         instrument: str | None = None,
         base: _Base | None = None,
-    ) -> tuple[ArmTrack, Parts | None]:
+    ) -> tuple[ArmTrack, Links | None]:
         """Return an arm's columns, and its parts at the rows of bodies.
 
         Args:
@@ -241,7 +241,7 @@ class _Clock:
         )
         return track, parts
 
-    def timeline(self, kind: Kind, arms: Sequence[tuple[ArmTrack, Parts | None]], **more: Any) -> Timeline:
+    def timeline(self, kind: Kind, arms: Sequence[tuple[ArmTrack, Links | None]], **more: Any) -> Timeline:
         """Return a timeline of arms, with the distance between the bodies of the first two if both are known."""
         steps = [np.linalg.norm(np.diff(one.tip_mm, axis=0), axis=1) for one, _ in arms]
         way = np.append(0.0, np.cumsum(np.nan_to_num(np.sum(steps, axis=0))))
@@ -410,17 +410,15 @@ def timeline_of_plan(
         played: The newest playback, of which the distances are shown; None if there is none.
         odds: For each pass the probability that it succeeds.
     """
-    t, m, at_s = trajectory, trajectory.psm_m, trajectory.stamps_s
+    t, at_s = trajectory, trajectory.stamps_s
     clock = _Clock.of(float(at_s[0]), float(at_s[-1]), t.rate_hz)
-    jaw = None if t.jaw_rad is None else (at_s, t.jaw_rad)
-    still = np.eye(3), np.zeros(3)
-    poses = at_s, t.tip_mm, t.rotation_xyzw
-    arms = [clock.track(f"{PSM_A} ({arm})", frame, poses, jaw, (at_s, t.joints), t.instrument, still)]
-    if m is not None:
-        base = matrix_of(m.base_xyzw[None])[0], m.base_mm
-        tip_mm, rotation = forward(m.joints, m.instrument)
-        seen = at_s, tip_mm @ base[0].T + base[1], quaternion_of(base[0] @ rotation)
-        arms.append(clock.track(PSM_M, frame, seen, None, (at_s, m.joints), m.instrument, base))
+    arms = []
+    for one in t.arms:
+        poses, base = one.poses(), (one.base, one.base_mm)
+        name, jaw = (f"{PSM_A} ({arm})", one.jaw_rad) if one.name == PSM_A else (PSM_M, None)
+        pose = at_s, poses.tip_mm, quaternion_of(poses.rotation)
+        shown = None if jaw is None else (at_s, jaw)
+        arms.append(clock.track(name, frame, pose, shown, (at_s, one.joints), one.instrument, base))
     return clock.timeline(
         "plan",
         arms,

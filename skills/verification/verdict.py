@@ -35,16 +35,17 @@ from skills.learning.policy import Policy
 from skills.notebook import card
 from skills.planning.motion_laws import A2, PHASES
 from skills.planning.plan import SuturePlan
-from skills.planning.trajectory import Trajectory
+from skills.planning.trajectory import PSM_M, Trajectory
 from skills.verification.arm_errors import UNCALIBRATED, ArmErrors
-from skills.verification.asked import asked_of
 from skills.verification.bodies import BodiesReport, bodies_clearance
 from skills.verification.clearance import psm_m_poses
+from skills.verification.deviations import Deviations, Mismatch
 from skills.verification.gates import SCENE, ArmSamples, Failure, Figures, Limits, figures_of, first_failure
-from skills.verification.intent import IntentComparison, Mismatch, compare
+from skills.verification.intent import compare
 from skills.verification.monte_carlo import doubt
-from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, PSM_M, Playback
+from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, Playback
 from skills.verification.probabilities import UPWARDS, Doubt
+from skills.verification.requested import requested_motion
 from skills.verification.scene_clearance import NEEDLE, SceneClearance, SceneReport, clearance_of, flat_tissue
 
 
@@ -212,7 +213,7 @@ def judge(
     approach_m: ArrayLike | None = None,
     beside: SceneClearance | None = None,
     pad_is_tissue: bool = True,
-    intent: IntentComparison | None = None,
+    intent: Deviations | None = None,
 ) -> PlaybackReport:
     """Compare the measurements with the intended motion, with what was asked, and with the limits.
 
@@ -284,7 +285,7 @@ def judge(
         files=dict(playback.files),
         settings=limits,
         bodies=outer.report,
-        intent=None if intent is None else intent.deviations,
+        intent=None if intent is None else intent.greatest,
         means=dict(MEANS),
     )
 
@@ -340,7 +341,7 @@ def judge_plan(
     """
     approach_m = None if plan.psm_m is None else plan.psm_m.approach
     beside = None if plan.scene is None else clearance_of(trajectory, plan.scene)
-    intent = compare(asked_of(plan, policy, demo), trajectory, playback.joints)
+    intent = compare(requested_motion(plan, policy, demo), trajectory, playback.joints)
     # The simulator's pad lies below the motion wherever that goes, so it is no tissue and no gate.
     report = judge(playback, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
     tissue = None if plan.scene is None else plan.scene.tissue

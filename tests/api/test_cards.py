@@ -18,7 +18,7 @@ from skills.db.session import Database
 from skills.library.policies.cards import card_of as card_of_version
 from skills.library.policies.versions import find_version
 from skills.packing import sha256
-from skills.schemas.given import PolicyCard
+from skills.schemas.cards import PolicyCard
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases

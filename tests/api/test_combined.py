@@ -8,7 +8,7 @@ import skills
 from skills.client import Client, policies
 from skills.comparison.combining import COMBININGS
 from skills.schemas.policies import Combined
-from skills.schemas.requests import CombineIn
+from skills.schemas.training import CombineIn
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.by_day import some
 from tests.library import cases

@@ -172,7 +172,8 @@ def test_a_client_reads_answers_without_a_server_or_a_compiler():
 
 
 def test_a_client_passes_over_what_a_newer_service_adds():
-    from skills.schemas.given import Page, SutureType
+    from skills.schemas import Page
+    from skills.schemas.people import SutureType
 
     newer = {"suture": "a", "name": "A", "also_called": [], "family": "f", "description": "", "colour": "red"}
     page = Page[SutureType].model_validate({"items": [newer], "next": None, "total": 1})

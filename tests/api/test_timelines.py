@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from sqlalchemy import select
 
 from skills.db.models import Plan, PolicyVersion
-from skills.schemas.plans import MotionTimeline
+from skills.schemas.timelines import MotionTimeline
 from skills.verification.timeline import Timeline
 from tests.api.keyed import copy_of_told
 from tests.api.service import Service, assert_problem, serving

@@ -39,7 +39,8 @@ from skills.library.people.catalogue import put_surgeon, seed_catalogue
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import Lesson, learn_style, lessons
 from skills.library.recordings.demos import upload_demo
-from skills.schemas.requests import DemoIn, RetrainingIn
+from skills.schemas.demos import DemoIn
+from skills.schemas.training import RetrainingIn
 from skills.serving import environment
 from skills.settings import Settings
 from tests.demonstration.synthetic import RATE_HZ, motions

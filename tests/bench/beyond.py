@@ -31,7 +31,7 @@ from skills.learning.certificate import certify
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.networks import DDPG, DQN, TRPO, network_q
 from skills.learning.policy import LEARNERS, Learner, Policy, rollout_from
-from skills.learning.slip import replay
+from skills.learning.slip_runs import replay
 from skills.report.numbers import paper_source, sample_source
 from skills.settings import Settings
 from tests.demonstration.synthetic import winding_path

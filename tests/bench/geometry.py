@@ -22,7 +22,7 @@ from skills.formats import read_recording
 from skills.gridworld.grid import choose_grid, discretize
 from skills.kinematics import POINTING_DOWN, reachable
 from skills.learning.evaluation import dtw
-from skills.learning.slip import replay
+from skills.learning.slip_runs import replay
 from skills.planning.path_fit import fit_to_demo, trace
 from skills.seeds.recordings import sample_recordings
 

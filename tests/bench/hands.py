@@ -29,7 +29,7 @@ from skills.formats import read_recording
 from skills.gridworld.grid import choose_grid, discretize
 from skills.kinematics import matrix_of
 from skills.learning.evaluation import dtw
-from skills.learning.slip import replay
+from skills.learning.slip_runs import replay
 from skills.planning.handoff import needle_tips_mm
 from skills.planning.motion_laws import followed
 from skills.planning.path_fit import TREMOR_S, fit_to_demo, hand_along, trace

@@ -24,7 +24,7 @@ from skills.db.session import Database
 from skills.library.operation.sweep import sweep_erased
 from skills.library.people.erasure import erase_surgeon
 from skills.library.policies.retraining import request_retraining
-from skills.schemas.requests import RetrainingIn
+from skills.schemas.training import RetrainingIn
 from tests import backends
 from tests.api.service import Service
 from tests.db.test_query_plans import noted

@@ -15,10 +15,10 @@ from skills.planning.handoff import HOLDING_RAD, PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import Trajectory, joint_ratios, time_parametrise
 from skills.simulation import player, simulator
-from skills.verification.asked import asked_of
 from skills.verification.bodies import bodies_clearance
 from skills.verification.intent import compare
 from skills.verification.playback import CLEARANCE_SEEN_MM
+from skills.verification.requested import requested_motion
 from skills.verification.scene_clearance import clearance_of
 from skills.verification.verdict import judge
 from tests.bench.timing import gain, in_turn
@@ -67,7 +67,7 @@ def verdicts(table: Table) -> None:
     plan = stack(policy, points, demo=demo, psm_m=BESIDE)
     trajectory = trajectory_of(plan)
     scene_mm = Scene(plan.frame, tissue=Tissue.plane((0.0, 0.0, -165.0), (0.0, 0.0, 1.0)))
-    given = asked_of(plan, policy, demo)
+    given = requested_motion(plan, policy, demo)
     asked = player.request(trajectory, player.default_pad_top(trajectory))
     playback = player.play(trajectory)
 

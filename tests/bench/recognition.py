@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
+from skills.arithmetic import wilson
 from skills.comparison.distances import STATES, distances, resampled, shape_of
 from skills.comparison.recognition import FAMILIES, NUMBERS, Validated, signature_of, usable, validate, vote
 from skills.demonstration.demonstration import Demo, cut_demo
@@ -25,7 +26,6 @@ from skills.demonstration.recording import Recording
 from skills.demonstration.segments import Segment, movements_by_arm, propose_by_arm
 from skills.errors import BadPath
 from skills.formats.jigsaws import read_jigsaws, trials
-from skills.learning.slip import wilson
 
 TASKS = {"knot_tying": "Knot_Tying", "needle_passing": "Needle_Passing"}  # folders of the archive, and their names
 DRAWS = 2000  # of the bootstrap over trials

@@ -27,7 +27,7 @@ from skills.library.policies import versions
 from skills.library.policies.retraining import choose_styles, list_styles
 from skills.library.policies.training import request_training
 from skills.library.recordings import demos
-from skills.schemas.requests import RetrainingIn, TrainingIn
+from skills.schemas.training import RetrainingIn, TrainingIn
 from tests import backends
 from tests.api.service import serving
 from tests.bench.timing import Work, in_turn

@@ -20,7 +20,7 @@ from skills.db.changes import announce, changes_of
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.library.policies.training import request_training
-from skills.schemas.requests import TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.serving import environment
 from skills.settings import Settings
 from tests import backends

@@ -14,26 +14,27 @@ from rich.table import Table
 
 from skills.arrays import Floats, Ints
 from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, discretize
+from skills.gridworld.hazards import Hazards, hazards_of
 from skills.gridworld.reward import sparse_reward
-from skills.gridworld.scene import Box, Hazards, Scene, Tissue, hazards_of
+from skills.gridworld.scene import Box, Scene, Tissue
+from skills.gridworld.slip import slip_model
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.in_scene import certify_in_scene, learn_in_scene
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.slip import (
+from skills.learning.slip_runs import (
     STOPS,
     Controller,
     FollowPolicy,
     ReplayMoves,
     ReplayPositions,
     StartAnew,
-    TwoLineRule,
     budget,
-    draw_slips,
     follows,
     shortest_way,
     walk,
 )
+from tests.learning.two_line_rule import TwoLineRule
 
 RUNS, GAMMA, SLIPS = 1000, 0.95, (0.1, 0.2, 0.3)
 CORNER = (0, 0, 10)  # the start cell whose shortest way the box stands across, six moves from the path
@@ -88,7 +89,7 @@ def tissue(table: Table) -> None:
 def controllers(path: GridPath, hazards: Hazards, slip: float) -> dict[str, Controller]:
     """Return ours, learnt with this slip, and the rules."""
     reward = sparse_reward(path)
-    exact = learn_in_scene(reward, ValueIteration(GAMMA, slip), hazards)
+    exact = learn_in_scene(reward, ValueIteration(GAMMA, slip=slip), hazards)
     learnt = learn_in_scene(reward, PhaseQLearning(alpha=0.02, gamma=GAMMA, slip=slip), hazards)
     for name, policy in (("exact", exact), ("learnt", learnt)):
         print(f"slip {slip}, {name}: {certify_in_scene(policy, hazards)[0]}", file=sys.stderr)
@@ -116,7 +117,7 @@ def replays(path: GridPath, start: int) -> dict[str, Controller]:
 def _compare(
     table: Table, name: str, rivals: dict[str, Controller], path: GridPath, start: int, hazards: Hazards, slip: float
 ) -> None:
-    slips = draw_slips(slip, runs=RUNS, moves=budget(path), seed=0)
+    slips = slip_model(slip).draw(runs=RUNS, moves=budget(path), seed=0)
     for rival, controller in rivals.items():
         walks = walk(controller, path, start, slips, hazards.touches)
         assert walks.touched is not None

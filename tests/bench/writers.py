@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 from skills.db.session import Database
 from skills.library.policies.retraining import request_retraining
 from skills.library.recordings.recordings import store_recording, tell_upload
-from skills.schemas.requests import RetrainingIn
+from skills.schemas.training import RetrainingIn
 from tests import backends
 from tests.library import cases, hospital
 from tests.library.styles import parts_of

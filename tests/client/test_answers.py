@@ -15,7 +15,8 @@ from skills.client import AsyncClient, Client, NotUnderstood, Problem
 from skills.client.connection import call
 from skills.errors import BadSettings, SkillsError
 from skills.formats import write_mcap
-from skills.schemas.given import Policy, Surgeon
+from skills.schemas.people import Surgeon
+from skills.schemas.policies import Policy
 from skills.settings import Settings
 from tests.client.peers import BOTH, SURGEON, Script, Time, answer, asked, at_once
 from tests.formats import bags

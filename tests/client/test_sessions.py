@@ -24,8 +24,7 @@ from skills.client.sessions import LOST
 from skills.errors import BadInput, BadSettings
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 from skills.library.people.keys import create_key
-from skills.schemas.given import NextPose, SessionOpening, SessionPose
-from skills.schemas.policies import SessionLimits
+from skills.schemas.pose_styles import NextPose, SessionLimits, SessionOpening, SessionPose
 from tests import backends
 from tests.api import service as services
 from tests.api.service import KESTREL, MCAP

@@ -13,7 +13,7 @@ import httpx2 as httpx
 import pytest
 
 from skills.client import AsyncClient, Client, JobFailed, JobTakesLonger, NotReached, Problem, Retrying
-from skills.schemas.given import Job
+from skills.schemas.operation import Job
 from tests.client.peers import BOTH, Script, Time, answer, refusal
 from tests.waiting import END_S, crowded
 

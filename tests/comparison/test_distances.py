@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skills.comparison import _kernels
 from skills.comparison.distances import (
     MANY,
     STATES,
@@ -25,6 +24,7 @@ from skills.comparison.distances import (
     resampled,
     shape_of,
     spread,
+    warped,
 )
 from skills.errors import BadPath
 from skills.learning.evaluation import dtw
@@ -57,7 +57,6 @@ def test_they_are_those_of_a_second_method(method):
 def test_compiled_and_plain_agree_to_the_last_bit():
     rng = np.random.default_rng(6)
     shapes, plain = rng.normal(0, 10, (3, 12, 3)), np.empty((3, 3))
-    warped = _kernels.warped
     for i in range(3):
         for j in range(3):
             plain[i, j] = warped(shapes[i], shapes[j], np.empty(13))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skills.comparison import _kernels, nearest
+from skills.comparison import nearest
 from skills.comparison.distances import STATES, distances, in_lengths, shape_of
 from skills.comparison.nearest import COARSE, FINE, ShapeIndex, boxes_of
 from tests.comparison.cohort import cohort
@@ -50,16 +50,16 @@ def test_bounds_never_exceed_the_distance(seed: int, spread_mm: float):
     total = distances([one], [other])[0, 0]
     for parts in (COARSE, FINE):
         mine, theirs = boxes_of(one, parts).astype(float), boxes_of(other, parts).astype(float)
-        bound = STATES / parts * _kernels.boxes_apart(mine, theirs, np.empty(parts), np.empty(parts))
+        bound = STATES / parts * nearest.boxes_apart(mine, theirs, np.empty(parts), np.empty(parts))
         assert bound <= total * nearest.SLACK
         held, bounds = np.array([boxes_of(other, parts)], np.float32).transpose(2, 1, 0), np.empty(1)
         room = np.empty(1), np.empty((parts, 1))
-        _kernels.bound_all(mine, STATES / parts, held, np.ones(1), 0, 1, *room, bounds)
+        nearest.bound_all(mine, STATES / parts, held, np.ones(1), 0, 1, *room, bounds)
         assert bounds[0] == pytest.approx(bound, rel=1e-12)
         apart, ahead, before = np.empty((parts, STATES)), np.empty((parts, STATES)), np.empty(STATES)
-        nearby = _kernels.points_apart(one.T, theirs, apart, before)
-        assert nearby <= nearest.SLACK * _kernels.ahead_within(apart, before, np.inf, ahead) <= total * nearest.SLACK
-        assert _kernels.ahead_within(apart, before, total * nearest.SLACK, ahead) == ahead[0, 0] < np.inf
+        nearby = nearest.points_apart(one.T, theirs, apart, before)
+        assert nearby <= nearest.SLACK * nearest.ahead_within(apart, before, np.inf, ahead) <= total * nearest.SLACK
+        assert nearest.ahead_within(apart, before, total * nearest.SLACK, ahead) == ahead[0, 0] < np.inf
 
 
 @settings(deadline=None)
@@ -68,12 +68,12 @@ def test_a_warping_is_exact_within_its_limit_and_infinite_beyond(seed: int, spre
     one, other = varied(2, seed, spread_mm)
     total, rows = distances([one], [other])[0, 0], np.empty((2, STATES + 1))
     apart, ahead, before = np.empty((FINE, STATES)), np.empty((FINE, STATES)), np.empty(STATES)
-    _kernels.points_apart(one.T, boxes_of(other, FINE).astype(float), apart, before)
+    nearest.points_apart(one.T, boxes_of(other, FINE).astype(float), apart, before)
     limit = share * total
-    bound = _kernels.ahead_within(apart, before, limit * nearest.SLACK, ahead)
+    bound = nearest.ahead_within(apart, before, limit * nearest.SLACK, ahead)
     found = np.inf
     if bound < np.inf:
-        found = _kernels.warped_within(one, other, 1.0, ahead, limit * nearest.SLACK, *rows)
+        found = nearest.warped_within(one, other, 1.0, ahead, limit * nearest.SLACK, *rows)
     if total <= limit:
         assert found == total
     assert found in (total, np.inf)
@@ -98,8 +98,8 @@ def searched(shapes: np.ndarray, count: int, kernels: tuple) -> tuple[list, list
     return bounds.tolist(), rows.tolist(), totals.tolist(), warped
 
 
-PLAIN = _kernels.bound_all, _kernels.search
-COMPILED = _kernels.bound_all_compiled, _kernels.search_compiled
+PLAIN = nearest.bound_all.plain, nearest.search_shapes.plain
+COMPILED = nearest.bound_all, nearest.search_shapes
 
 
 @pytest.mark.parametrize("count", [5, pytest.param(12, marks=pytest.mark.nightly)])

@@ -10,7 +10,7 @@ from sqlalchemy.engine import Engine
 
 from skills.db import AsJson
 from skills.errors import Corrupt
-from skills.schemas.given import Consent
+from skills.schemas.people import Consent
 from tests import backends
 
 CONSENTS = Table(

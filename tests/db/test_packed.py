@@ -20,19 +20,22 @@ from skills.comparison.distances import STATES, Measured
 from skills.comparison.recognition import NUMBERS
 from skills.db import packed  # the tables declare the types that may be stored
 from skills.db.packed import FORMAT, Packed, digest, pack, seal, unpack
-from skills.demonstration.demonstration import Demo, Partner, Pause, cut_demo
-from skills.demonstration.partner import PartnerMotion
+from skills.demonstration.demonstration import Demo, cut_demo
+from skills.demonstration.movement import Pause
+from skills.demonstration.partner import Partner, PartnerMotion
 from skills.errors import Corrupt
 from skills.formats import read_recording
 from skills.gridworld.grid import PAPER_GRID, GridPath, GridWorld, discretize
+from skills.gridworld.hazards import Surroundings
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
-from skills.gridworld.scene import Box, Capsule, Scene, Surroundings, Tissue
+from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.learning.certificate import certify
-from skills.learning.dynamic_programming import ShortestWay, ValueIteration
+from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.learning.ties import ShortestWay
 from skills.learning.tube import certified_poses
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.motion_laws import Poses

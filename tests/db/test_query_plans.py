@@ -17,7 +17,7 @@ from skills.library.operation.overview import count_jobs, matrix, newest_job, re
 from skills.library.people import catalogue
 from skills.library.policies import batches, retraining, training, versions
 from skills.library.recordings import demos, proposals
-from skills.schemas.requests import RetrainingIn, TrainingIn
+from skills.schemas.training import RetrainingIn, TrainingIn
 from tests import backends
 from tests.library import hospital
 

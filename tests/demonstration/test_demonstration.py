@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skills.demonstration.demonstration import Motion, Recording, Signal, cut_demo, recorded_motion
+from skills.demonstration.demonstration import cut_demo
+from skills.demonstration.recording import Motion, Recording, Signal, recorded_motion
 from skills.errors import BadInput, BadSegment, NotFinite, NotMetres, NoUsableTopic
 from tests.by_day import examples
 from tests.demonstration.strokes import RATE, line, motion, recording

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skills.demonstration.identification import FEWEST_SAMPLES, HYPOTHESES, identify, stated_instrument
+from skills.demonstration.hypotheses import HYPOTHESES, stated_instrument
+from skills.demonstration.identification import FEWEST_SAMPLES, identify
 from skills.errors import BadInput
 from skills.kinematics import JAW_TIP_MM, axes_of, forward, matrix_of
 from tests.demonstration.arms import MISTAKES, REAL, Mistake, cut, drawn, real

@@ -9,11 +9,13 @@ from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from skills import packing
-from skills.demonstration.demonstration import cut_demo, propose_segments
+from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.recording import Joints, Motion, Recording, base_frames
+from skills.demonstration.segments import propose_segments
 from skills.errors import JointsDisagree, NotMetres
 from skills.formats import write_mcap
-from skills.formats.reader_process import KNOWN, read_told, tell
+from skills.formats.parsed import parse, parse_recording
+from skills.formats.reader_process import KNOWN
 from skills.kinematics import angle_between, forward, instrument_of, matrix_of, quaternion_of, solutions_of
 from tests.demonstration.arms import MISTAKES, REAL, Recorded, another_unit, cut, drawn, real
 from tests.demonstration.sessions import A, Kind, M, session
@@ -58,7 +60,7 @@ def test_poses_and_partner_in_a_cameras_frame_become_those_of_the_base(recorded)
 
 def test_what_joints_show_travels_with_the_recording(recorded):
     """So that a cut in another process, or from the cache, does not compute it again."""
-    told, file = tell(recorded), io.BytesIO()
+    told, file = parse(recorded), io.BytesIO()
     packing.write(file, told, KNOWN)
     file.seek(0)
     again = packing.read(file, KNOWN)
@@ -187,7 +189,9 @@ def test_a_file_says_what_its_joints_show_and_no_planted_mistake_is_silent(mista
     for seed in range(count):
         one = drawn(2000 + seed) if seed % 4 else cut(real(REAL[seed // 4 % 3]), seed)
         try:
-            about = read_told(io.BytesIO(one_file(mistake(one, np.random.default_rng(seed)) if mistake else one))).about
+            about = parse_recording(
+                io.BytesIO(one_file(mistake(one, np.random.default_rng(seed)) if mistake else one))
+            ).about
         except NotMetres:  # positions a thousand times too large
             assert mistake is another_unit
             continue

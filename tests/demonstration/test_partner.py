@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skills.demonstration.demonstration import cut_demo, partner_motion, propose_segments
+from skills.demonstration.demonstration import cut_demo, partner_motion
+from skills.demonstration.segments import propose_segments
 from skills.kinematics import angle_between, matrix_of
 from tests.demonstration import sessions
 from tests.demonstration.sessions import A, Kind, M, session

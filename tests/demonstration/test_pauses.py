@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skills.demonstration.demonstration import Pause, cut_demo
+from skills.demonstration.demonstration import cut_demo
+from skills.demonstration.movement import Pause
 from skills.demonstration.recording import Signal
 from skills.errors import BadSegment
 from skills.gridworld.grid import discretize, fit_grid

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from skills.demonstration.demonstration import Demo, Pause, cut_demo
+from skills.demonstration.demonstration import Demo, cut_demo
+from skills.demonstration.movement import Pause
 from skills.demonstration.quality import describe
 from skills.demonstration.recording import Signal
 from skills.gridworld.grid import PAPER_GRID, describe_path, discretize, fit_grid

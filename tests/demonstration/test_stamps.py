@@ -9,8 +9,8 @@ from skills.demonstration.motion import DROPPED_GAP_NS, DROPPED_SHARE_LIMIT
 from skills.demonstration.recording import equal_samples, recorded_joints, recorded_motion, recorded_signal
 from skills.errors import BackwardStamps, NotFinite, NotMetres, RepeatedStamps
 from skills.formats import read_recording
-from skills.formats.reader_process import tell
-from skills.schemas.given import Recording
+from skills.formats.parsed import parse
+from skills.schemas.recordings import Recording
 
 STEP_NS = 10_000_000
 
@@ -139,11 +139,11 @@ def table(stamps_ns):
 
 
 def test_the_description_counts_dropped_and_equal_samples():
-    sound = tell(table(even(91))).about
+    sound = parse(table(even(91))).about
     assert (sound["dropped"], sound["quality"][0]["equal_samples"]) == ([], 0)
     stamps = even(100)
     stamps[50] = stamps[49] - 1
-    about = tell(table(stamps)).about
+    about = parse(table(stamps)).about
     assert about["dropped"] == [{"topic": "table", "backward_stamps": 1}]
     assert about["quality"][0]["equal_samples"] == 9
     rest = {"id": "0" * 64, "sha256": "0" * 64, "size_bytes": 1, "media_type": "text/csv", "format": "csv"}

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, seal, timetable
+from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, pass_times, seal
 from skills.formats.verify import JUDGED, check_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
@@ -104,6 +104,11 @@ def members(pass_index: int | None = None) -> dict[str, bytes]:
     folders = [folder_of(arm, "1" * 64) for arm in arms]
     executor = {"plan": "1" * 64, "passes": timetable(trajectory(), arms)}
     return papers(trajectory(), executor=executor) | folders[0] | folders[1]
+
+
+def timetable(made: Trajectory, arms: tuple[ArmMotion, ...]) -> list[dict[str, Any]]:
+    """Return the passes of a timetable as JSON."""
+    return [one.model_dump() for one in pass_times(made, arms)]
 
 
 def arm(name: str = "PSM2") -> ArmMotion:

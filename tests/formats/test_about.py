@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from skills.demonstration.recording import Joints, Label, Recording, Signal
-from skills.formats.reader_process import MOST, tell
+from skills.formats.parsed import MOST, parse
 from tests.demonstration import sessions
 from tests.demonstration.sessions import Kind, session
 
@@ -33,7 +33,7 @@ def recorded() -> Recording:
 
 
 def test_all_that_a_recording_has_is_told(recorded):
-    about = tell(recorded).about
+    about = parse(recorded).about
     assert about["joints"] == [{"arm": "PSM2", "topic": "/PSM2/measured_js", "joints": 6}]
     assert about["pedals"] == [{"topic": "/footpedals/coag", "presses": 1, "pressed_s": 3.0}]
     assert about["following"] == [{"teleoperation": "MTMR_PSM2", "following_s": pytest.approx(recorded.duration_s)}]
@@ -45,22 +45,22 @@ def test_all_that_a_recording_has_is_told(recorded):
 
 
 def test_where_an_arms_base_stands_in_the_camera_is_told(recorded):
-    about = tell(recorded).about
+    about = parse(recorded).about
     assert {(one["arm"], one["frame"]) for one in about["base_frames"]} == {("PSM1", "ECM"), ("PSM2", "ECM")}
 
 
 def test_it_is_plain_json(recorded):
-    about = tell(recorded).about
+    about = parse(recorded).about
     assert json.loads(json.dumps(about, allow_nan=False)) == json.loads(json.dumps(about))
 
 
 def test_a_recording_with_little_in_it_has_little_told():
     value, _ = session(Kind(seed=6, passes=1, jaw=False, clutch=False, both_arms=False, wrist=False))
-    about = tell(value).about
+    about = parse(value).about
     for name in ("joints", "masters", "pedals", "following", "scales", "labels"):
         assert about[name] == []
     empty = Signal(np.empty(0, np.int64), np.empty(0))
-    silent = tell(replace(value, following=(("MTMR_PSM2", empty),), scales=(("MTMR_PSM2", empty),))).about
+    silent = parse(replace(value, following=(("MTMR_PSM2", empty),), scales=(("MTMR_PSM2", empty),))).about
     assert silent["following"] == [{"teleoperation": "MTMR_PSM2", "following_s": 0.0}]
     assert silent["scales"] == []
 
@@ -68,7 +68,7 @@ def test_a_recording_with_little_in_it_has_little_told():
 def test_what_a_recording_may_make_as_long_as_it_likes_is_cut_and_counted(recorded):
     origin_ns = recorded.origin_ns
     marks = tuple(Label("knot", "stage", origin_ns + k, origin_ns + k + 1) for k in range(3 * MOST))
-    about = tell(replace(recorded, labels=marks)).about
+    about = parse(replace(recorded, labels=marks)).about
     assert (len(about["labels"]), about["counts"]["labels"]) == (MOST, 3 * MOST)
     assert about["counts"]["segments"] == len(about["segments"])
     assert sessions.A in {one["arm"] for one in about["segments"]}

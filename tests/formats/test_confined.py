@@ -18,7 +18,8 @@ from skills.demonstration.segments import Segment
 from skills.errors import BadColumns, BadInput, Busy, SkillsError, UnreadableRecording
 from skills.formats import read_recording, reader_process, write_mcap
 from skills.formats.mcap import _kernels
-from skills.formats.reader_process import KNOWN, ConfinedReader, Refusal, Told, read_told
+from skills.formats.parsed import ParsedContent, parse_recording
+from skills.formats.reader_process import KNOWN, ConfinedReader, Refusal
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer
 from tests.formats import bags
@@ -72,15 +73,15 @@ def test_every_value_of_a_recording_may_come_back():
     rooms = {one.__name__: vars(one) for one in (values, motion, recording)}
     assert {v for name, here in rooms.items() for v in here.values() if is_dataclass(v) and v.__module__ == name} == {
         *KNOWN.values()
-    } - {Refusal, Told, Segment, ArmIdentification, Identification}
+    } - {Refusal, ParsedContent, Segment, ArmIdentification, Identification}
 
 
 @pytest.mark.parametrize(("data", "how"), [(BAG, {}), (TABLE, {"frame": "ECM"})], ids=["bag", "csv"])
 def test_what_is_told_is_the_same_to_the_last_bit(reader, data, how):
     with tempfile.TemporaryFile() as file:
         file.write(data)
-        told = reader.tell(file, **how)
-    assert same(read_told(io.BytesIO(data), **how), told)
+        told = reader.parse(file, **how)
+    assert same(parse_recording(io.BytesIO(data), **how), told)
     assert told.about["segments"] == [
         vars(one) | {"reasons": list(one.reasons), "reason": one.reason} for one in told.proposed
     ]
@@ -191,7 +192,7 @@ def test_a_fault_of_ours_is_logged_without_the_file_in_it(monkeypatch):
 
     monkeypatch.setattr(reader_process, "read_recording", broken)
     with pytest.raises(RuntimeError, match=r"^KeyError$") as caught:
-        reader_process.parse(io.BytesIO(), io.BytesIO())
+        reader_process.read(io.BytesIO(), io.BytesIO())
     assert caught.value.__suppress_context__
     assert caught.traceback[-1].name == "broken"
 

@@ -13,7 +13,7 @@ from skills.errors import (
     UnreadableRecording,
 )
 from skills.formats import read_recording
-from skills.formats.reader_process import tell
+from skills.formats.parsed import parse
 from tests.formats import written
 
 PLAIN = written.ee_csv(rows=120)
@@ -50,7 +50,7 @@ def test_both_arms_are_read_with_their_jaws_to_the_last_bit():
     assert (motion.topic, motion.frame, recording.format) == ("/PSM2/measured_cp", "PSM2_base", "csv")
     jaw, want = recording.jaw_of("PSM2"), written.sample("kestrel").jaw_of("PSM2")
     np.testing.assert_array_equal(jaw.values, np.interp(motion.stamps_ns, want.stamps_ns, want.values))
-    assert [one.arm for one in tell(recording).proposed] == ["PSM2"]
+    assert [one.arm for one in parse(recording).proposed] == ["PSM2"]
 
 
 def test_numbers_as_numpy_prints_them_say_the_same():

@@ -46,7 +46,7 @@ def both(loop, arguments, written):
 
 def followed(data: bytes, begin=0, count=0, room=None):
     room = len(data) // 31 if room is None else room
-    columns = [(room, np.int64), (room, np.int64), (room, np.uint16), (room, np.uint64)]
+    columns = [(room, np.int64), (room, np.int64), (room, np.uint16)]
     return both("follow", (seen(data), begin, count), columns)
 
 
@@ -102,48 +102,47 @@ U64 = st.integers(0, 2**64 - 1)
 @given(st.data())
 def test_both_kernels_take_the_same_words_and_never_read_past_the_end(data):
     said = data.draw(st.binary(max_size=120))
-    count, shape_count = data.draw(st.integers(0, 8)), data.draw(st.integers(1, 3))
     near = st.one_of(st.integers(-3, 130), st.sampled_from([-(2**63), 2**63 - 1, 2**63 - 8]))
-    messages = np.array(data.draw(st.lists(near, min_size=count, max_size=count)), np.int64)
+    messages = np.array(data.draw(st.lists(near, max_size=8)), np.int64)
+    count = len(messages)
     lengths = np.array(data.draw(st.lists(st.integers(0, 2), min_size=count, max_size=count)), np.int64)
-    kinds = np.array(data.draw(st.lists(st.integers(-1, shape_count), min_size=count, max_size=count)), np.int64)
-    sizes = np.array(data.draw(st.lists(st.integers(0, 2), min_size=shape_count, max_size=shape_count)), np.int64)
-    looks = data.draw(st.lists(st.integers(0, 2), min_size=shape_count, max_size=shape_count))
-    widths = data.draw(st.lists(st.integers(0, 3), min_size=shape_count, max_size=shape_count))
-    words = np.cumsum([0, *np.add(looks, widths)]).astype(np.uint64)
-    gets = words[1:] - np.array(widths, np.uint64)
-    total = int(words[-1])
+    size, looks, width = (data.draw(st.integers(0, most)) for most in (2, 2, 3))
+    total = looks + width
     places = np.array(data.draw(st.lists(st.integers(0, 60), min_size=total, max_size=total)), np.uint64)
     masks = np.array(data.draw(st.lists(st.sampled_from([0, 1, 2**63]), min_size=total, max_size=total)), np.uint64)
-    rooms = np.cumsum([0, *(width * data.draw(st.integers(0, 4)) for width in widths)]).astype(np.uint64)
-    reach = np.zeros(shape_count, np.uint64)
-    shown = seen(said)
-    _, (taken, found, fits) = both(
-        "take",
-        (shown, messages, lengths, kinds, sizes, words, gets, places, masks, np.zeros(total, np.uint64), reach, rooms),
-        [(int(rooms[-1]), np.uint64), (shape_count, np.uint64), (count, np.bool_)],
-    )
+    shape = (size, looks, places, masks, np.zeros(total, np.uint64))
+    (found,), (_, fits) = taken_by(said, messages, lengths, shape)
+    last = max(places.astype(int).tolist(), default=-8)
     for n in np.flatnonzero(fits):
-        own = kinds[n]
-        last = max((int(place) for place in places[int(words[own]) : int(words[own + 1])]), default=-8)
-        assert lengths[n] == sizes[own]
+        assert lengths[n] == size
         assert 0 <= messages[n] <= len(said) - last - 8
-    assert found.sum() == fits.sum()
-    assert len(taken) == int(rooms[-1])
+    assert found == fits.sum()
+
+
+def taken_by(said: bytes, messages, lengths, shape):
+    """Return the number of messages of a shape, the words of all messages as one array, and which have the shape."""
+    width = len(shape[2]) - shape[1]
+    plain = _kernels.take, _kernels.take_compiled
+
+    def in_rows(take):
+        return lambda *given: (take(*given[:-2], given[-2].reshape(len(messages), width), given[-1]),)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, take in zip(("take", "take_compiled"), plain, strict=True):
+            patch.setattr(_kernels, name, in_rows(take))
+        written = [(len(messages) * width, np.uint64), (len(messages), np.bool_)]
+        return both("take", (seen(said), messages, lengths, *shape), written)
 
 
 def test_words_by_hand():
     """The first eight bytes are taken if byte 3 is a 3; so a message needs 11 bytes."""
-    data = seen(bytes(range(50)) + bytes(range(11)))
+    said = bytes(range(50)) + bytes(range(11))
     messages = np.array([0, 10, 50, 51, -1], np.int64)
-    zeros = np.zeros(len(messages), np.int64)
-    words, gets, places = (np.array(numbers, np.uint64) for numbers in ([0, 2], [1], [3, 0]))
-    masks, marked, rooms = (np.array(numbers, np.uint64) for numbers in ([0xFF, 0], [3, 0], [0, 5]))
-    shape = (zeros[:1], words, gets, places, masks, marked, np.zeros(1, np.uint64), rooms)
-    written = [(5, np.uint64), (1, np.uint64), (5, np.bool_)]
-    _, (taken, found, fits) = both("take", (data, messages, zeros, zeros, *shape), written)
+    places, masks, marked = (np.array(numbers, np.uint64) for numbers in ([3, 0], [0xFF, 0], [3, 0]))
+    shape = (0, 1, places, masks, marked)
+    (found,), (taken, fits) = taken_by(said, messages, np.zeros(len(messages), np.int64), shape)
     assert fits.tolist() == [True, False, True, False, False]
-    assert found.tolist() == [2]
+    assert found == 2
     assert taken[:2].tolist() == 2 * [int.from_bytes(bytes(range(8)), "little")]
 
 

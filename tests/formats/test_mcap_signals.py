@@ -156,7 +156,7 @@ def test_a_definition_without_what_is_wanted_is_left_out():
 def test_a_topic_and_its_type_say_what_it_tells(topic, message_type, kind, whose):
     said = topics.meaning(topic, message_type)
     assert said is not None
-    assert (said.kind, said.whose) == (kind, whose)
+    assert (said.kind, said.owner) == (kind, whose)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from skills import packing
-from skills.formats.reader_process import KNOWN, READER_VERSION, read_told
+from skills.formats.parsed import parse_recording
+from skills.formats.reader_process import KNOWN, READER_VERSION
 from skills.seeds.recordings import sample_recordings
 from tests.formats import bags, lerobots, trials
 from tests.library import cases
@@ -32,7 +33,7 @@ def test_equal_bytes_are_read_alike_as_long_as_the_version_stays():
     """
     parts: list[Any] = [[name, [field.name for field in fields(kind)]] for name, kind in sorted(KNOWN.items())]
     for data, how in FILES:
-        told, arrays = read_told(io.BytesIO(data), **how), []
+        told, arrays = parse_recording(io.BytesIO(data), **how), []
         tree = [packing.flatten(part, arrays, KNOWN) for part in (told.recording, told.proposed)]
         parts.append([rounded(tree), [rounded(array.tolist()) for array in arrays]])
     assert DIGESTS[READER_VERSION] == packing.sha256(packing.canonical(parts))

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skills.demonstration.demonstration import cut_demo, propose_segments
+from skills.demonstration.demonstration import cut_demo
+from skills.demonstration.segments import propose_segments
 from skills.formats import read_recording
 from skills.gridworld.grid import discretize, fit_grid
 from tests.formats.bags import sample_folder

@@ -15,13 +15,14 @@ from rosbags.highlevel import AnyReader
 from skills.errors import BadBag, BadPlan
 from skills.formats.replay_bag import (
     EPOCH_NS,
+    PhaseTimes,
     arm_names,
     arms_of,
     folder_of,
     held_jaw_rad,
     notes_of,
+    pass_times,
     seal,
-    timetable,
     velocities_of,
 )
 from skills.kinematics import forward
@@ -131,32 +132,32 @@ def test_the_same_trajectory_gives_the_same_bytes():
 def test_the_timetable_has_every_phase_and_hand_over_on_one_clock():
     """Two passes of 81 samples at 200 Hz, 60 of A1 and 21 of A2, a second apart; stamps begin at 1 s."""
     arms = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
-    first, second = timetable(trajectory(), arms)
-    assert first["phases"] == [
-        {"phase": "A1", "from_ns": 1_000_000_000, "to_ns": 1_295_000_000},
-        {"phase": "A2", "from_ns": 1_300_000_000, "to_ns": 1_400_000_000},
+    first, second = pass_times(trajectory(), arms)
+    assert first.phases == [
+        PhaseTimes(phase="A1", from_ns=1_000_000_000, to_ns=1_295_000_000),
+        PhaseTimes(phase="A2", from_ns=1_300_000_000, to_ns=1_400_000_000),
     ]
-    assert first["hand_over"] is first["take_back"] is None  # the jaws of this motion do not move
-    assert second["phases"][0]["from_ns"] == 2_405_000_000
+    assert first.hand_over is first.take_back is None  # the jaws of this motion do not move
+    assert second.phases[0].from_ns == 2_405_000_000
     alone = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=1)
-    assert timetable(trajectory(), alone) == [second]
+    assert pass_times(trajectory(), alone) == [second]
 
 
 def test_the_timetable_states_when_the_needle_changes_hands():
     """PSM_M's jaw closes before PSM_A's opens, and in a further pass the other way round; both by the setpoints."""
     motion = time_parametrise([hand_off(), hand_off(-8.0)], rate_hz=100.0, psm_m=BESIDE)
     arms = arms_of(motion, arm="PSM2", frame=FRAME, other="PSM1")
-    first, second = timetable(motion, arms)
-    assert first["take_back"] is None
-    for change, order in ((first["hand_over"], ("PSM1", "PSM2")), (second["take_back"], ("PSM2", "PSM1"))):
-        closes, opens = change["jaws_in_order"]
-        assert (closes["arm"], opens["arm"]) == order
-        assert (closes["jaw_rad"], opens["jaw_rad"]) == (JAW_CLOSED_RAD, JAW_OPEN_RAD)
-        assert change["at_ns"] == closes["from_ns"] < closes["to_ns"] == opens["from_ns"] < opens["to_ns"]
-        assert opens["to_ns"] - closes["from_ns"] == pytest.approx(2e9 * JAW_S, abs=2.1e7)
-        for one in change["jaws_in_order"]:
-            (arm,) = (arm for arm in arms if arm.name == one["arm"])
-            assert arm.jaw_rad[arm.stamps_ns == one["to_ns"]] == one["jaw_rad"]
+    first, second = pass_times(motion, arms)
+    assert first.take_back is None
+    for change, order in ((first.hand_over, ("PSM1", "PSM2")), (second.take_back, ("PSM2", "PSM1"))):
+        closes, opens = change.jaws_in_order
+        assert (closes.arm, opens.arm) == order
+        assert (closes.jaw_rad, opens.jaw_rad) == (JAW_CLOSED_RAD, JAW_OPEN_RAD)
+        assert change.at_ns == closes.from_ns < closes.to_ns == opens.from_ns < opens.to_ns
+        assert opens.to_ns - closes.from_ns == pytest.approx(2e9 * JAW_S, abs=2.1e7)
+        for one in change.jaws_in_order:
+            (arm,) = (arm for arm in arms if arm.name == one.arm)
+            assert arm.jaw_rad[arm.stamps_ns == one.to_ns] == one.jaw_rad
     held = np.minimum(*(arm.jaw_rad for arm in arms))
     assert (held == JAW_CLOSED_RAD).all()  # at every sample one of both holds the needle
 

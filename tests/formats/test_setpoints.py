@@ -16,7 +16,8 @@ from skills.formats.bag_folder import join
 from skills.formats.bag_writer import Message, messages_of, write_messages
 from skills.formats.columns import APART_MM
 from skills.formats.mcap import read_mcap
-from skills.formats.reader_process import KNOWN, tell
+from skills.formats.parsed import parse
+from skills.formats.reader_process import KNOWN
 from tests.formats import lerobots, written
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, assert_same, recording
 from tests.formats.others import NOETIC, rosbag1, whole
@@ -108,7 +109,7 @@ def test_setpoints_change_no_demonstration():
     plain, commanded = (read_mcap(io.BytesIO(mcap(said))) for said in ([], tips(x_m=0.2)))
     one, other = (cut_demo(found, arm="PSM2") for found in (plain, commanded))
     np.testing.assert_array_equal(one.tip_mm, other.tip_mm)
-    assert tell(plain).proposed == tell(commanded).proposed
+    assert parse(plain).proposed == parse(commanded).proposed
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -148,7 +149,7 @@ def test_a_damaged_message_of_setpoints_refuses_no_bag(tmp_path, monkeypatch):
     found = read_recording(io.BytesIO(data))
     assert_same(found, recording(COUNT), tolerance_mm=1e-12)
     assert found.setpoints == ()
-    assert dict(found.left_out) == {TIP: "A message of the topic is damaged."}
+    assert dict(found.left_out) == {TIP: f"A message of {TIP} ends within a field."}
 
 
 def test_parts_that_do_not_agree_lose_their_setpoints_alone():
@@ -312,8 +313,8 @@ def test_setpoints_pass_between_processes_unchanged():
 
 
 def test_setpoints_are_described_where_there_are_any():
-    assert tell(recording()).about["setpoints"] == []
-    assert tell(whole()).about["setpoints"] == [
+    assert parse(recording()).about["setpoints"] == []
+    assert parse(whole()).about["setpoints"] == [
         {"arm": "PSM2", "topic": TIP, "frame": "PSM2_base", "samples": 10},
         {"arm": "PSM2", "topic": "/PSM2/setpoint_cp", "frame": "ECM", "samples": 10},
         {"arm": "PSM2", "topic": JAW, "frame": None, "samples": 10},

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 
 from skills.errors import BadBag, BadSignature, SkillsError
-from skills.formats.replay_bag import arms_of, folder_of, seal, timetable
+from skills.formats.replay_bag import arms_of, folder_of, seal
 from skills.formats.verify import SIGNATURE, check_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import A1, A2, Trajectory
 from skills.transparency import Checkpoint, PublicKey, SigningKey, Tree, attest, read_envelope
-from tests.formats.replays import FRAME, judged, members, papers
+from tests.formats.replays import FRAME, judged, members, papers, timetable
 from tests.formats.replays import trajectory as short
 from tests.independent_history import check_envelope
 

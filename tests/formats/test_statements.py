@@ -10,7 +10,7 @@ from skills.demonstration.recording import Format
 from skills.errors import BadRecording, BadSettings
 from skills.formats import read_recording, write_mcap
 from skills.formats.bag_writer import messages_of
-from skills.schemas.requests import TableIn
+from skills.schemas.recordings import TableIn
 from tests.formats import bags, lerobots, others, trials, written
 from tests.formats.test_extract import rows, table
 

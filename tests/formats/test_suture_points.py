@@ -10,7 +10,7 @@ from skills.errors import MixedFrames, NotAQuaternion, NotMetres, NoUsableTopic,
 from skills.formats import bag_writer
 from skills.formats.bag_writer import write_messages
 from skills.formats.reader_process import ConfinedReader
-from skills.formats.suture_points import PARSE, SuturePoints, read_scene, suture_points
+from skills.formats.suture_points import READ, SuturePoints, read_scene, suture_points
 from skills.kinematics import matrix_of, quaternion_of
 from skills.sandbox import ProcessLimits
 
@@ -178,7 +178,7 @@ def test_it_is_read_in_a_process_of_its_own_and_refusals_come_back():
     )
     with ConfinedReader(limits, at_once=2) as read, tempfile.TemporaryFile() as file:
         file.write(scene(world()))
-        assert suture_points(read(file, target=PARSE)) == found(world())
+        assert suture_points(read(file, target=READ)) == found(world())
         file.truncate(200)
         with pytest.raises(UnreadableRecording, match="truncated"):
-            read(file, target=PARSE)
+            read(file, target=READ)

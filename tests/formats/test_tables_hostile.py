@@ -19,7 +19,7 @@ from skills.demonstration.recording import Recording
 from skills.errors import SkillsError
 from skills.formats import read_recording
 from skills.formats.cells import NS_PER
-from skills.formats.reader_process import tell
+from skills.formats.parsed import parse
 from tests.formats import hostile, written
 
 QUICK, WHOLE = 20, 1500
@@ -76,7 +76,7 @@ def read(data: bytes, how: dict[str, Any]) -> Recording | str:
     """Read and describe a file; return its recording, or the class of its refusal. All other exceptions are errors."""
     try:
         recording = read_recording(io.BytesIO(data), **how)
-        tell(recording)
+        parse(recording)
     except SkillsError as refused:
         refused.message.encode()
         return type(refused).__name__

@@ -15,7 +15,7 @@ from skills.formats import topics
 from skills.formats.mcap import reader
 from skills.formats.mcap import records as mcap_records
 from skills.formats.mcap.reader import Walker
-from skills.formats.mcap.records import Chain, follow, unpack
+from skills.formats.mcap.records import Chain, unpack
 from tests.by_day import examples, some
 from tests.formats import records
 from tests.formats.definitions import DEFINITIONS
@@ -26,13 +26,18 @@ DEFINED = TYPE + channel(1, 1, "/a")
 ONE = message(1, 5, b"\0\1\0\0\1")
 
 
+def log_ns_of(data, begin):
+    """Return the log time in the header of a message, which ends with it and the publish time."""
+    return int.from_bytes(data[begin - 16 : begin - 8].tobytes(), "little")
+
+
 def walked(data: bytes):
     """Walk over a complete file: the walker, and channel, log time and content of every message."""
     walk = Walker(io.BytesIO(data))
     said = [
-        (stretch.channel.topic, int(log_ns), bytes(stretch.data[begin : begin + length]))
+        (stretch.channel.topic, log_ns_of(stretch.data, begin), bytes(stretch.data[begin : begin + length]))
         for stretch in walk.stretches()
-        for log_ns, begin, length in zip(stretch.log_ns, stretch.begin, stretch.length, strict=True)
+        for begin, length in zip(stretch.begin, stretch.length, strict=True)
     ]
     return walk, said
 
@@ -52,7 +57,9 @@ ENDS = st.sampled_from(
 
 
 def followed(data: bytes):
-    return follow(np.frombuffer(data, np.uint8))
+    chain = Chain(np.frombuffer(data, np.uint8))
+    chain.follow(len(data))
+    return chain
 
 
 @examples(200)
@@ -62,8 +69,8 @@ def test_what_was_put_one_behind_the_other_is_found_and_nothing_else(said, end):
         message(k, 7 * k, content) if kind == 5 else record(kind, content) for k, (kind, content) in enumerate(said)
     ]
     found, begins = followed(b"".join(pieces) + end), np.cumsum([0, *map(len, pieces)]).tolist()
-    expected = [(begins[k], len(content), k, 7 * k) for k, (kind, content) in enumerate(said) if kind == 5]
-    told = (found.messages, found.lengths, found.channels, found.log_ns)
+    expected = [(begins[k], len(content), k) for k, (kind, content) in enumerate(said) if kind == 5]
+    told = (found.messages, found.lengths, found.channels)
     assert list(zip(*(column.tolist() for column in told), strict=True)) == expected
     others = [(kind, begins[k] + 9, begins[k + 1]) for k, (kind, _) in enumerate(said) if kind != 5]
     assert (found.others, found.end) == (others, begins[-1])

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
 from skills.errors import BadSettings
-from skills.gridworld.scene import MOST_HEIGHTS, Scene, tissue_of_mesh
+from skills.gridworld.mesh import tissue_of_mesh
+from skills.gridworld.scene import MOST_HEIGHTS, Scene
 
 SQUARE = [[0, 0, 2], [10, 0, 2], [0, 10, 2], [10, 10, 2]]
 HALVES = [[0, 1, 2], [3, 2, 1]]

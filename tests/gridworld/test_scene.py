@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from skills.errors import BadSettings
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
-from skills.gridworld.scene import STAY, Box, Capsule, Scene, SceneCosts, Tissue, hazards_of
+from skills.gridworld.hazards import STAY, SceneCosts, hazards_of
+from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.packing import canonical, sha256
 from tests.by_day import examples
 

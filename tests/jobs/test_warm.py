@@ -7,10 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from skills.compiled import check_kept, kept_in
+from skills.compiled import cache_folders, check_cache_folder
 from skills.errors import BadSettings
-from skills.formats.mcap._kernels import follow_compiled
-from skills.learning._kernels import warp_compiled
 from tests.api.processes import free_port
 from tests.learning.test_kernel_cache import start, told
 from tests.waiting import END_S
@@ -72,40 +70,40 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_folder_of_ones_own_is_taken_and_so_is_the_one_beside_the_code(folder):
-    check_kept(folder)
-    check_kept(kept_in(warp_compiled))
-    check_kept(kept_in(follow_compiled))
+    check_cache_folder(folder)
+    for each in cache_folders():
+        check_cache_folder(each)
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o775, 0o1777, 0o702], ids=oct)
 def test_a_folder_that_others_can_write_to_is_refused(folder, mode):
     folder.chmod(mode)
     with pytest.raises(BadSettings, match=rf"other users can write to {folder}: set NUMBA_CACHE_DIR"):
-        check_kept(folder)
+        check_cache_folder(folder)
 
 
 def test_a_folder_in_a_world_writable_parent_is_refused_unless_sticky(folder):
     folder.parent.chmod(0o777)
     with pytest.raises(BadSettings, match=f"other users can write to {folder.parent}:"):
-        check_kept(folder)
+        check_cache_folder(folder)
     folder.parent.chmod(0o1777)
-    check_kept(folder)
+    check_cache_folder(folder)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="a folder of another user: only root can make one")
 def test_another_users_folder_is_refused(folder):
     os.chown(folder, 12345, -1)
     with pytest.raises(BadSettings, match="other users can write"):
-        check_kept(folder)
+        check_cache_folder(folder)
 
 
 def test_a_named_cache_folder_that_is_not_writable_is_refused(folder, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/cache")
     for kept in (folder, None):
         with pytest.raises(BadSettings, match="NUMBA_CACHE_DIR=/dev/null/cache is not writable"):
-            check_kept(kept)
+            check_cache_folder(kept)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder.parent))
-    check_kept(folder)
+    check_cache_folder(folder)
 
 
 @pytest.mark.nightly  # by day tests/formats/test_confined.py, of the readers
@@ -137,7 +135,7 @@ def test_a_running_server_exits_if_its_compiled_loops_would_be_refused(tmp_path)
 
 
 def test_nowhere_to_keep_them_is_said():
-    logged = told(start("from skills.compiled import check_kept\ncheck_kept(None)\ntell()"))["logged"]
+    logged = told(start("from skills.compiled import check_cache_folder\ncheck_cache_folder(None)\ntell()"))["logged"]
     assert (
         "every process compiles them again; set NUMBA_CACHE_DIR to a folder that only this user can write to" in logged
     )

@@ -6,7 +6,7 @@ from hypothesis.extra.numpy import arrays
 
 from skills.errors import BadInput, EmptyPath
 from skills.gridworld.grid import PAPER_GRID, GridWorld, discretisation_rmse
-from skills.learning.evaluation import TIE_BREAK, dtw, measure
+from skills.learning.evaluation import TIE_BREAK, dtw, measure, warp
 from skills.learning.policy import Rollout
 from tests.gridworld.paths import named_path
 
@@ -145,3 +145,15 @@ def test_with_hysteresis_the_loss_is_measured_from_the_samples_own_cells():
     assert discretisation_rmse(tip_mm, grid) == pytest.approx(
         (np.sqrt((3**2 + 2**2) / 3), 0, np.sqrt(4**2 / 3)), abs=1e-12
     )  # mm
+
+
+@settings(deadline=None)
+@given(arrays(float, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.floats(0, 1e6)))
+def test_the_compiled_warp_and_the_plain_one_agree_to_the_last_bit(distance):
+    costs = []
+    for fill in (warp.plain, warp):
+        cost = np.full((distance.shape[0] + 1, distance.shape[1] + 1), np.inf)
+        cost[0, 0] = 0.0
+        fill(distance, cost)
+        costs.append(cost.tobytes())
+    assert costs[0] == costs[1]

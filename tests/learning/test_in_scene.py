@@ -11,14 +11,16 @@ import pytest
 from skills.errors import BadSettings
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
+from skills.gridworld.hazards import SceneCosts, hazards_of
 from skills.gridworld.reward import sparse_reward
-from skills.gridworld.scene import Box, Scene, SceneCosts, Tissue, hazards_of
+from skills.gridworld.scene import Box, Scene, Tissue
+from skills.gridworld.slip import STEADY, slip_model
 from skills.learning.certificate import certify
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.in_scene import certify_in_scene, learn_in_scene, odds_in_scene
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.slip import STEADY, FollowPolicy, budget, draw_slips, follows, walk
+from skills.learning.slip_runs import FollowPolicy, budget, follows, walk
 from tests.by_day import some
 from tests.gridworld.paths import WALKS, named_path
 
@@ -65,7 +67,7 @@ def test_odds_and_value_in_a_corridor_are_those_worked_by_hand(slip):
 def test_exact_values_satisfy_bellmans_equation_written_out(slip):
     path, hazards = room(close=0.2, deeper_per_mm=0.03, touch=30.0)
     gamma, domain, grid = 0.9, Domain(path, phased=True), path.grid
-    q = learn_in_scene(sparse_reward(path), ValueIteration(gamma, slip), hazards).q
+    q = learn_in_scene(sparse_reward(path), ValueIteration(gamma, slip=slip), hazards).q
     live = domain.certified & ~domain.terminal & ~hazards.forbidden[domain.state_of]
     rewards = sparse_reward(path).rewards
     for row in np.random.default_rng(0).choice(np.flatnonzero(live), 150):
@@ -95,7 +97,9 @@ def test_the_exact_odds_are_those_of_many_runs():
     policy = learn_in_scene(sparse_reward(path), ValueIteration(gamma=0.95, slip=0.3), hazards)
     _, odds = certify_in_scene(policy, hazards)
     for start in (path.start, 0 + 3, int(path.grid.states_of([0, 0, 3]))):
-        walks = walk(FollowPolicy(policy), path, start, draw_slips(0.3, runs=4000, moves=300, seed=1), hazards.touches)
+        walks = walk(
+            FollowPolicy(policy), path, start, slip_model(0.3).draw(runs=4000, moves=300, seed=1), hazards.touches
+        )
         assert walks.touched is not None
         assert follows(walks).mean() == pytest.approx(odds.finishes[start], abs=0.035)  # four standard deviations
         assert walks.touched.mean() == pytest.approx(odds.touches[start], abs=0.035)
@@ -178,7 +182,9 @@ def test_a_gamma_too_small_beside_the_cost_of_touching_is_refused():
 def test_more_slips_than_learnt_for_finish_less_often():
     path, hazards = room()
     policy = learn_in_scene(sparse_reward(path), ValueIteration(gamma=0.95, slip=0.1), hazards)
-    finishing = [odds_in_scene(policy, hazards, slip).finishes[~hazards.forbidden].mean() for slip in (0.0, 0.3, 0.6)]
+    finishing = [
+        odds_in_scene(policy, hazards, slip_model(slip)).finishes[~hazards.forbidden].mean() for slip in (0.0, 0.3, 0.6)
+    ]
     assert finishing == sorted(finishing, reverse=True)
     assert finishing[0] == 1
     assert finishing[-1] < 0.8

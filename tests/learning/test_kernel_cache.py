@@ -20,14 +20,15 @@ import numpy as np
 from skills.learning.certificate import certify
 from skills.learning.evaluation import dtw
 from skills.gridworld.grid import GridPath, GridWorld
-from skills.learning import _kernels
+from skills.compiled import LOOPS
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.packing import palette_of
 from skills.learning.policy import learn_tabular
 from skills.learning.pose_style import PosePath
 from skills.learning.tube import Hands, TubeLimits, advance, certify_tube, next_pose
 from skills.gridworld.reward import RewardLevels, sparse_reward
-loops = {name: loop for name, loop in vars(_kernels).items() if name.endswith("_compiled")}
+IN = ("skills.learning", "skills.packing")
+loops = {loop.plain.__name__: loop for loop in LOOPS if loop.plain.__module__.startswith(IN)}
 path = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), np.array([0, 1, 4, 3, 0, 13, 26]))
 def learn(levels=RewardLevels(), **settings):
     policy = learn_tabular(sparse_reward(path, levels), PhaseQLearning(**settings), 3)

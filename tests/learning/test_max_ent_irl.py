@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skills.errors import BadSettings
@@ -11,7 +11,7 @@ from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, sparse_reward
 from skills.learning.certificate import certify, coverage
 from skills.learning.dynamic_programming import Mdp, exact_q
-from skills.learning.max_ent_irl import MaxEntIRL, recover_reward, soft_visits
+from skills.learning.max_ent_irl import MaxEntIRL, recover_reward, soft_visits, sum_around
 from skills.learning.policy import learn_tabular, rollout_from
 from tests.by_day import examples, some
 from tests.gridworld.paths import WALKS, named_path, random_path
@@ -209,3 +209,21 @@ def test_a_path_that_is_too_long_for_its_grid_is_refused():
     path = GridPath(GridWorld((0.0, 0.0, 0.0), 1.0, (200, 200, 200)), np.array([0, 1, 2, 3]))
     with pytest.raises(BadSettings, match="3 moves in a grid of 8000000 cells are too many"):
         recover_reward(path, MaxEntIRL())
+
+
+@settings(deadline=None)
+@given(st.tuples(*[st.integers(1, 5)] * 3), st.integers(0, 2**32))
+def test_each_cell_and_its_neighbours_are_added_at_any_power_of_two(shape, seed):
+    rng = np.random.default_rng(seed)
+    numbers = rng.uniform(0.7, 2.8, shape) * (rng.random(shape) < 0.8)
+    powers = rng.integers(-100, 100, shape).astype(np.int32) + np.int32(5000)
+    padded = np.pad(np.ldexp(numbers, powers - 5000), 1)
+    expected = sum(padded[a : a + shape[0], b : b + shape[1], c : c + shape[2]] for a, b, c in MOVES + 1)
+    made = []
+    for add in (sum_around.plain, sum_around):
+        total, total_powers = np.empty(shape), np.empty(shape, np.int32)
+        add(numbers, powers, total, total_powers)
+        assert np.allclose(np.ldexp(total, total_powers - 5000 * (total > 0)), expected, rtol=1e-14, atol=0.0)
+        assert ((total == 0) | ((total >= 1) & (total < 2))).all()
+        made.append((total.tobytes(), total_powers.tobytes()))
+    assert made[0] == made[1]

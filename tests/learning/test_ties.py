@@ -13,12 +13,15 @@ from skills.errors import BadSettings
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
 from skills.learning import policy as policy_module
+from skills.learning import ties
 from skills.learning.certificate import certify, mdp_of
-from skills.learning.dynamic_programming import REMOTE_CENTRE, ShortestWay, ValueIteration, exact_q, rule_in
+from skills.learning.dynamic_programming import ValueIteration, exact_q
 from skills.learning.policy import Policy, learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
+from skills.learning.ties import REMOTE_CENTRE, ShortestWay, rule_in
 from tests.by_day import examples, some
 from tests.gridworld.paths import WALKS, learnt, named_path, random_path
+from tests.learning.loops import run_both
 
 STEPS = [Decimal(n).sqrt() for n in range(4)]
 DOWN = ShortestWay(depth_along=(0.0, -1.0, -2.0))
@@ -245,3 +248,14 @@ def test_a_policy_made_without_the_rule_takes_the_first_action():
     assert certificate.off_rule is None
     assert certificate.every_action_optimal
     assert isinstance(policy, Policy)
+
+
+SAMPLED = PhaseQLearning(alpha=0.5, max_steps=2, max_sweeps=3, slip=0.4)
+
+
+@pytest.mark.parametrize("learner", [PhaseQLearning(), SAMPLED], ids=["settled", "sampled"])
+@pytest.mark.parametrize("name", ["two cells", "to and fro"])
+def test_the_compiled_rule_and_the_plain_one_agree(monkeypatch, learner, name):
+    agreed = run_both(monkeypatch, ties, "find_equal", "choose_approaches", "count_off_rule")
+    certify(learn_tabular(sparse_reward(named_path(name)), learner, seed=5))
+    assert agreed == ["find_equal", "choose_approaches", "count_off_rule"]

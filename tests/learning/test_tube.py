@@ -24,7 +24,7 @@ from skills.learning.tube import (
     next_pose,
 )
 from skills.learning.tube_certificate import TubeClearance, TubeLimits
-from tests.learning.test_kernels import both
+from tests.learning.loops import run_both
 
 LIMITS = TubeLimits(step_mm=6.0, step_rad=0.2, disturbance_mm=1.0, disturbance_rad=0.02, start_mm=20.0, start_rad=0.5)
 
@@ -214,9 +214,7 @@ def test_the_compiled_tick_equals_that_of_scipy(ahead: int) -> None:
 
 
 def test_the_compiled_and_the_plain_ticks_agree_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    agreed: list[str] = []
-    for loop in ("step_along", "nearest_pose"):
-        monkeypatch.setattr(tube, f"{loop}_compiled", both(loop, agreed))
+    agreed = run_both(monkeypatch, tube, "step_along", "nearest_pose")
     certify_tube(a_path(), LIMITS)
     next_pose(a_path(), (10.0, 3.0, -118.0), (0.0, 0.0, 0.0, 1.0), None, LIMITS)
     assert set(agreed) == {"step_along", "nearest_pose"}

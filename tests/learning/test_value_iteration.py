@@ -1,10 +1,13 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from skills.errors import BadSettings
+from skills.gridworld.grid import MOVES
 from skills.gridworld.reward import RewardLevels, sparse_reward
 from skills.learning.certificate import certify
-from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.dynamic_programming import ValueIteration, settle, spread_worth
 from skills.learning.policy import MAX_SEED, learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
 from tests.gridworld.paths import WALKS, named_path, random_path
@@ -73,3 +76,38 @@ def test_moves_that_advance_nothing_must_pay_nothing():
     reward = sparse_reward(named_path("an angle"), RewardLevels(other=-0.5))
     with pytest.raises(BadSettings, match="`other` must be 0"):
         learn_tabular(reward, ValueIteration())
+
+
+@settings(deadline=None)
+@given(st.tuples(*[st.integers(1, 6)] * 3), st.integers(1, 5), st.integers(0, 2**32))
+def test_worth_spreads_from_given_cells_and_never_through_them(shape, count, seed):
+    rng = np.random.default_rng(seed)
+    given_cells = np.zeros(shape, bool)
+    given_cells[tuple(rng.integers(shape, size=(count, 3)).T)] = True
+    start = np.where(given_cells, rng.integers(-50, 50, size=shape), -(2**62))
+    expected, worth = np.full(shape, -(2**62)), start.copy()
+    for _ in range(given_cells.size + 1):  # all neighbours at once, as often as a way can be long
+        padded = np.pad(worth, 1, constant_values=-(2**62))
+        around = [padded[a : a + shape[0], b : b + shape[1], c : c + shape[2]] for a, b, c in MOVES + 1]
+        expected = np.maximum(expected, np.max(around, axis=0))
+        worth = np.where(given_cells, start, np.where(expected > -(2**61), expected - 7, -(2**62)))
+    for spread in (spread_worth.plain, spread_worth):
+        best, entering = np.full(shape, -(2**62)), start.copy()
+        spread(best, entering, given_cells, -7)
+        assert np.array_equal(best, expected)
+        assert np.array_equal(entering, worth)
+
+
+@pytest.mark.parametrize("sweeps", [2, 10])
+def test_the_compiled_values_settle_as_the_plain_ones_do_to_the_last_bit(sweeps):
+    path = named_path("a figure of eight")
+    found = []
+    for iterate in (settle.plain, settle):
+        rewards = sparse_reward(path).rewards
+        best, worth = np.zeros(path.grid.n_states), rewards.copy()
+        stays = np.arange(path.grid.n_states) != path.goal
+        shape = np.array(path.grid.shape)
+        settled = iterate(best, worth, rewards, stays, shape, path.goal, -1.0, 0.5, 1e-14, sweeps)
+        found.append((settled, best.tobytes(), worth.tobytes()))
+    assert found[0] == found[1]
+    assert found[0][0] == (sweeps == 10)

@@ -27,8 +27,9 @@ from skills.library.policies.training import request_training
 from skills.library.recordings.demos import upload_demo
 from skills.library.recordings.recordings import Upload
 from skills.packing import sha256
+from skills.schemas.demos import DemoIn
 from skills.schemas.plans import PlanIn
-from skills.schemas.requests import DemoIn, TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 
 SUTURE = "simple-running"

@@ -14,9 +14,9 @@ from skills.db.session import Database
 from skills.demonstration.recording import Motion, Recording, Signal
 from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.recordings.datasets import dataset_chunk, request_dataset
-from skills.schemas.requests import DatasetIn
+from skills.schemas.datasets import DatasetIn
 from tests.library import cases
 
 ARMS = ("PSM1", "PSM2")
@@ -91,7 +91,7 @@ def read_episode(data: bytes, folder: Path, number: int) -> Recording:
 
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read recordings without starting a reader's process."""
-    reader = SimpleNamespace(tell=read_told, server=SimpleNamespace(close=lambda: None))
+    reader = SimpleNamespace(parse=parse_recording, server=SimpleNamespace(close=lambda: None))
     monkeypatch.setattr("skills.library.recordings.datasets.confined_reader", lambda _settings: reader)
 
 

@@ -7,7 +7,7 @@ from sqlalchemy import func, select, text
 from skills.db.models import PolicyVersion, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.learning.policy import describe_learner
 from skills.library.operation.jobs import PART
 from skills.library.people.catalogue import put_surgeon, seed_catalogue
@@ -15,7 +15,8 @@ from skills.library.policies.retraining import request_retraining
 from skills.library.recordings import demos
 from skills.library.recordings.demos import Made, make_demo
 from skills.library.recordings.recordings import entry_of, find_recording, keep
-from skills.schemas.requests import DemoIn, RetrainingIn
+from skills.schemas.demos import DemoIn
+from skills.schemas.training import RetrainingIn
 from tests.library import cases
 
 NO_CONSENT = {"consent": {"uses": ["atlas"], "until": None}}
@@ -41,7 +42,7 @@ def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
 
 def made_once(database: Database) -> tuple[Made, str]:
     upload = cases.upload(cases.hand_off())
-    told = read_told(upload.file)
+    told = parse_recording(upload.file)
     with database.writing() as session:
         keep(session, upload, told, entry_of(upload, told), "test")
     return make_demo(told, DemoIn(surgeon="anybody", suture=cases.SUTURE)), upload.sha256

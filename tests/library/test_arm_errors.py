@@ -16,8 +16,10 @@ from skills.formats import bag_writer as messages
 from skills.formats.bag_writer import Message, write_messages
 from skills.kinematics import forward, quaternion_of
 from skills.library.plans.arm_errors import read_measured, stated_errors
-from skills.verification.arm_errors import SIZES, UNCALIBRATED, MeasuredArm, calibrate_arm, rotation_of
+from skills.verification.arm_calibration import MeasuredArm, calibrate_arm
+from skills.verification.arm_errors import SIZES, UNCALIBRATED
 from skills.verification.arm_slip import measure_slip
+from skills.verification.error_draws import rotation_of
 from tests.formats.bags import sample_folder
 from tests.verification.test_arm_errors import lasting, recorded
 

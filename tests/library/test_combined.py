@@ -11,7 +11,7 @@ from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, 
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.learning.evaluation import dtw
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import inspect_installation, inspect_policies
@@ -24,10 +24,10 @@ from skills.library.policies.cards import card_of
 from skills.library.policies.releases import release, standing
 from skills.library.policies.versions import find_by_digest, learnt_from, path_of
 from skills.library.recordings.demos import upload_demo, withdraw_demo
-from skills.schemas.requests import DemoIn
+from skills.schemas.demos import DemoIn
 from skills.settings import Settings
-from skills.verification.asked import asked_of
 from skills.verification.intent import compare
+from skills.verification.requested import requested_motion
 from tests import backends
 from tests.library import cases
 from tests.library.styles import retrain
@@ -180,8 +180,8 @@ def test_a_plan_follows_it_and_a_card_tells_of_it(database: Database, how):
         followed, card = learnt_from(stored), card_of(session, stored)
         assert np.abs(plan.plan.passes[0].tip_mm[-1] - [5.0, 55.0, -125.0]).max() < 1e-9
         assert dtw(plan.plan.passes[0].tip_mm, followed.tip_mm).differences_mm.sum(axis=1).mean() < 5.0
-        asked = asked_of(plan.plan, learnt(stored), hand_of(stored))
-    assert all(one.value <= one.limit for one in compare(asked, trajectory_of(plan.plan)).deviations)
+        asked = requested_motion(plan.plan, learnt(stored), hand_of(stored))
+    assert all(one.value <= one.limit for one in compare(asked, trajectory_of(plan.plan)).greatest)
     assert "3 recorded demonstrations" in card.facts.what_it_is[0]
     assert card.facts.combined.kind == how.kind
     links = [(link.what, link.sha256) for link in card.facts.lineage.chain]
@@ -237,7 +237,7 @@ def test_others_than_its_own_demonstrations_are_found(database: Database):
     ]
     other = "stored with other demonstrations than its manifest names"
     relearn = Settings(database_url=database.url)
-    parts = {part.what: part.left_out for part in inspect_policies(database, read_told, relearn)}
+    parts = {part.what: part.left_out for part in inspect_policies(database, parse_recording, relearn)}
     assert parts == {
         "policies learnt again": [("policy_versions 1", f"{other}, not learnt again")],
         "certificates": [("policy_versions 1", f"{other}, its certificate was not computed again")],

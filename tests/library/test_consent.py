@@ -12,7 +12,7 @@ from skills.db.models import Release
 from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound, SkillsError
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.comparison import atlas, scores
 from skills.library.operation import overview
 from skills.library.people import consent
@@ -20,7 +20,7 @@ from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.consent import covered, may
 from skills.library.plans import plans
 from skills.library.policies import batches, releases, retraining, training, versions
-from skills.schemas.requests import ScoreIn
+from skills.schemas.scores import ScoreIn
 from tests.library import cases
 from tests.library.cases import SUTURE
 from tests.library.styles import add_styles, ask_retraining, count_versions, counted, parts_of, states_of, styles_of
@@ -192,9 +192,9 @@ def test_consent_withdrawn_during_scoring_returns_no_score(database: Database, m
         with monkeypatch.context() as meanwhile:
             midway(meanwhile, scores, "laid_on", lambda: agree(database, NO_ATLAS, surgeon))  # noqa: B023
             with pytest.raises(Conflict, match=f"'{surgeon}' does not cover atlas"):
-                scores.score(database, asked, read_told)
+                scores.score(database, asked, parse_recording)
         agree(database, ALL, surgeon)
-    assert scores.score(database, asked, read_told).figures
+    assert scores.score(database, asked, parse_recording).figures
 
 
 NO_ATLAS = {"uses": ["training"], "until": None}

@@ -18,7 +18,8 @@ from skills.db.row_visibility import Only
 from skills.db.service_tables import DatasetDemonstration, Event, Job
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound, TooLarge
-from skills.formats.reader_process import ConfinedReader, Told
+from skills.formats.parsed import ParsedContent
+from skills.formats.reader_process import ConfinedReader
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.jobs import cancel, find_job, list_jobs
 from skills.library.people import consent
@@ -206,13 +207,13 @@ def test_a_dataset_over_the_limit_is_not_stored(database: Database):
 
 def test_a_confined_reader_reads_what_is_not_cached(database: Database, monkeypatch: pytest.MonkeyPatch):
     add(database, session_of())
-    tell, told = ConfinedReader.tell, []
+    tell, told = ConfinedReader.parse, []
 
-    def counted(reader: ConfinedReader, *given: Any, **how: Any) -> Told:
+    def counted(reader: ConfinedReader, *given: Any, **how: Any) -> ParsedContent:
         told.append(reader)
         return tell(reader, *given, **how)
 
-    monkeypatch.setattr(ConfinedReader, "tell", counted)
+    monkeypatch.setattr(ConfinedReader, "parse", counted)
     assert zip_of(database, export(database))
     assert told == []
     with database.writing() as session:
@@ -298,7 +299,7 @@ def midway(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], None]) -> None
 
 
 def exports_module() -> Any:
-    from skills.library.recordings import datasets
+    from skills.library.recordings.recordings import datasets
 
     return datasets
 

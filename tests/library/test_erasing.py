@@ -25,7 +25,7 @@ from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.recordings.demos import add_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
-from skills.schemas.requests import DemoIn
+from skills.schemas.demos import DemoIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.db.test_query_plans import noted, plan_of

@@ -12,8 +12,8 @@ from skills.fields import as_json
 from skills.library.policies import batches, releases, versions
 from skills.library.policies.releases import fit_of_versions, not_worse
 from skills.library.recordings.demos import withdraw_demo
-from skills.schemas.policies import FitOnTheSame
-from skills.schemas.requests import DemoIn
+from skills.schemas.demos import DemoIn
+from skills.schemas.training import FitOnTheSame
 from tests.library import cases
 from tests.library.styles import retrain, styles_of
 

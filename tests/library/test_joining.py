@@ -18,7 +18,7 @@ from skills.library.policies import releases
 from skills.library.policies.releases import refusals
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import near_limits, request_training
-from skills.schemas.requests import RetrainingIn, TrainingIn
+from skills.schemas.training import RetrainingIn, TrainingIn
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import ask_retraining, parts_of, styles_of

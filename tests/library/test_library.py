@@ -30,7 +30,7 @@ from skills.library.policies import releases
 from skills.library.policies.versions import learnt, policy_of
 from skills.library.recordings.demos import add_demo, find_demo, withdraw_demo
 from skills.library.recordings.recordings import recording_bytes, store_recording
-from skills.schemas.requests import DemoIn
+from skills.schemas.demos import DemoIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases

@@ -25,7 +25,8 @@ from skills.library.policies.training import request_training, train_style
 from skills.library.policies.versions import find_version
 from skills.library.recordings.demos import add_demo
 from skills.library.recordings.recordings import store_recording
-from skills.schemas.requests import DemoIn, TrainingIn
+from skills.schemas.demos import DemoIn
+from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases

@@ -14,19 +14,20 @@ from skills.db.row_visibility import Only
 from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.errors import Conflict
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.comparison.scores import LEAST_DEMOS, score
 from skills.library.operation.backup import back_up, keep_erasures, read_erasures, restore
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.overview import matrix
 from skills.library.people.erasure import erase_demo
+from skills.library.policies import find_by_digest
 from skills.library.policies.cards import card_of
 from skills.library.policies.releases import release, remedy, standing
-from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
-from skills.schemas.requests import OutcomeIn, ScoreIn
+from skills.schemas.demos import OutcomeIn
+from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
 from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, styles_of
@@ -349,10 +350,10 @@ def test_a_failure_is_compared_only_if_named_and_in_no_percentile(database: Data
     good, bad = add(database), add(database, 1.0)
     mark(database, bad, "failure")
     asked = {"surgeon": "kestrel", "suture": cases.SUTURE, "demo": bad.sha256}
-    found = score(database, ScoreIn(**asked), read_told)
+    found = score(database, ScoreIn(**asked), parse_recording)
     assert found.reference.demo == good.sha256
     assert [one.demo for one in found.curve] == [good.sha256, bad.sha256]
-    named = score(database, ScoreIn(**asked, reference=bad.sha256), read_told)
+    named = score(database, ScoreIn(**asked, reference=bad.sha256), parse_recording)
     assert named.reference.because == "it was requested, and is marked failure"
     cases.add_surgeon(database, "plover", skill_level="novice")
     cases.add_surgeon(database, "wren", skill_level="novice")
@@ -360,7 +361,7 @@ def test_a_failure_is_compared_only_if_named_and_in_no_percentile(database: Data
         cases.add_demo(database, cases.hand_off((0.0, 0.5 * (number + 1), 0.0)), ("plover", "wren")[number % 2])
     fell = cases.add_demo(database, cases.hand_off((0.0, 4.0, 0.0)), "wren")
     for demos in (LEAST_DEMOS + 1, LEAST_DEMOS):
-        levels = score(database, ScoreIn(**asked), read_told).percentiles
+        levels = score(database, ScoreIn(**asked), parse_recording).percentiles
         assert [one.demos for one in levels if one.level == "novice"] == [demos]
         mark(database, fell, "failure")
 

@@ -18,7 +18,7 @@ from skills.db.session import Database
 from skills.errors import Busy, Corrupt, NotFound
 from skills.formats import media_type_of
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
-from skills.formats.reader_process import Told, read_told, tell
+from skills.formats.parsed import ParsedContent, parse, parse_recording
 from skills.library.comparison import scores
 from skills.library.operation import overview
 from skills.library.operation.backup import back_up, restore
@@ -28,7 +28,9 @@ from skills.library.people.erasure import erase_surgeon
 from skills.library.recordings import recordings
 from skills.library.recordings.demos import add_demo
 from skills.library.recordings.recordings import alike, entry_of, put_entry, store_recording, stored_recording
-from skills.schemas.requests import DemoIn, Reading, ScoreIn
+from skills.schemas.demos import DemoIn
+from skills.schemas.recordings import Reading
+from skills.schemas.scores import ScoreIn
 from skills.seeds.recordings import sample_recordings
 from tests.by_day import some
 from tests.formats import bags, lerobots, trials
@@ -39,16 +41,16 @@ TABLE = cases.hand_off()
 CUT = DemoIn(surgeon="kestrel", suture=cases.SUTURE, start_s=0.1, end_s=1.0)
 
 
-def never(file: BinaryIO, **how: Any) -> Told:
+def never(file: BinaryIO, **how: Any) -> ParsedContent:
     """A reader that must not be called."""
     raise AssertionError("the bytes were decoded again")
 
 
-def counting(into: list[Told]) -> Callable[..., Told]:
+def counting(into: list[ParsedContent]) -> Callable[..., ParsedContent]:
     """Return a reader that notes what it reads."""
 
-    def read(file: BinaryIO, **how: Any) -> Told:
-        into.append(read_told(file, **how))
+    def read(file: BinaryIO, **how: Any) -> ParsedContent:
+        into.append(parse_recording(file, **how))
         return into[-1]
 
     return read
@@ -84,14 +86,14 @@ def test_cutting_scoring_and_the_page_do_not_decode_a_stored_recording(database:
     sha256 = add(database)
     asked = ScoreIn(surgeon="kestrel", suture=cases.SUTURE, recording=sha256, start_s=0.0, end_s=0.9)
 
-    def results(read: Callable[..., Told]) -> list[Any]:
+    def results(read: Callable[..., ParsedContent]) -> list[Any]:
         demo = add_demo(database, sha256, CUT, "test", read).row.sha256
         score = scores.score(database, asked, read).model_dump() | {"curve": None}
         return [demo, score, overview.traces_of(database, sha256, read)]
 
     kept = results(never)
     forget(database)
-    decoded: list[Told] = []
+    decoded: list[ParsedContent] = []
     assert results(counting(decoded)) == kept
     assert len(decoded) == 1  # the first use fills the cache again
 
@@ -113,7 +115,7 @@ def test_the_cached_content_is_the_decoded_one_to_the_last_bit(database: Databas
     sha256 = add(database, data, **reading)
     with database.reading() as session:
         stored = recordings.find_recording(session, sha256)
-    decoded = read_told(io.BytesIO(data), **stored.reading)
+    decoded = parse_recording(io.BytesIO(data), **stored.reading)
     assert same(decoded, stored_recording(database, sha256, never))
     assert stored.format == decoded.recording.format  # the detected format has been a column from the first version on
     assert recordings.recording_json(stored)["format"] == stored.format
@@ -136,11 +138,11 @@ def test_a_large_content_is_stored_in_chunks(database: Database, monkeypatch: py
     data = sample_recordings()[0].data
     sha256 = add(database, data)
     assert counted(database)[1] > 50
-    assert same(read_told(io.BytesIO(data)), stored_recording(database, sha256, never))
+    assert same(parse_recording(io.BytesIO(data)), stored_recording(database, sha256, never))
     with database.writing() as session:  # replaced whole
         stored = recordings.find_recording(session, sha256)
-        put_entry(session, stored.row, entry_of(cases.upload(data), read_told(io.BytesIO(data))))
-    assert same(read_told(io.BytesIO(data)), stored_recording(database, sha256, never))
+        put_entry(session, stored.row, entry_of(cases.upload(data), parse_recording(io.BytesIO(data))))
+    assert same(parse_recording(io.BytesIO(data)), stored_recording(database, sha256, never))
 
 
 # ---- entries that may not be used ------------------------------------------------------------------------------------
@@ -210,7 +212,7 @@ def test_an_entry_of_another_recording_is_not_used(database: Database):
                 changed = text(f"UPDATE {table} SET {column} = :value WHERE recording_row = :row")
                 session.execute(changed, {"value": value, "row": row})
     for sha256 in (mine, other):
-        decoded: list[Told] = []
+        decoded: list[ParsedContent] = []
         assert same(stored_recording(database, sha256, counting(decoded)), decoded[0])
 
 
@@ -221,11 +223,11 @@ def test_a_content_that_no_recording_can_have_is_not_used(database: Database):
     motion = told.recording.motions[0]
     object.__setattr__(motion, "tip_mm", np.full(motion.tip_mm.shape, np.nan))
     replace_entry(database, sha256, told)
-    decoded: list[Told] = []
+    decoded: list[ParsedContent] = []
     assert same(stored_recording(database, sha256, counting(decoded)), decoded[0])
 
 
-def replace_entry(database: Database, sha256: str, told: Told) -> None:
+def replace_entry(database: Database, sha256: str, told: ParsedContent) -> None:
     """Store a content with its correct digest, as somebody with write access who knows the format would."""
     with database.writing() as session:
         stored = recordings.find_recording(session, sha256)
@@ -235,7 +237,7 @@ def replace_entry(database: Database, sha256: str, told: Told) -> None:
 def test_verify_compares_the_newest_content_or_all_with_the_bytes(database: Database):
     first, second = add(database), add(database, cases.hand_off((2.5, 0.0, 0.0)))
     assert faults(database, decode_all=True) == []
-    false = tell(read_told(io.BytesIO(cases.hand_off((0.0, 2.5, 0.0)))).recording)
+    false = parse(parse_recording(io.BytesIO(cases.hand_off((0.0, 2.5, 0.0)))).recording)
     replace_entry(database, first, false)
     assert faults(database) == []
     assert faults(database, decode_all=True) == [
@@ -249,11 +251,11 @@ def test_verify_compares_the_newest_content_or_all_with_the_bytes(database: Data
 
 
 def test_contents_are_alike_within_rounding_and_in_nothing_else():
-    one = read_told(io.BytesIO(TABLE)).recording
-    shifted = read_told(io.BytesIO(cases.hand_off((1e-9, 0.0, 0.0)))).recording
-    other = read_told(io.BytesIO(cases.hand_off((1e-5, 0.0, 0.0)))).recording
+    one = parse_recording(io.BytesIO(TABLE)).recording
+    shifted = parse_recording(io.BytesIO(cases.hand_off((1e-9, 0.0, 0.0)))).recording
+    other = parse_recording(io.BytesIO(cases.hand_off((1e-5, 0.0, 0.0)))).recording
     assert alike(one, one) and alike(one, shifted) and not alike(one, other)
-    assert not alike(one, read_told(io.BytesIO(cases.bag())).recording)
+    assert not alike(one, parse_recording(io.BytesIO(cases.bag())).recording)
     assert not alike((1.0,), (1.0, 1.0)) and not alike(1, 1.0) and not alike(float("nan"), float("nan"))
 
 
@@ -288,13 +290,13 @@ def test_a_recording_that_is_erased_while_it_is_read_is_not_cached(database: Dat
     sha256 = add(database)
     forget(database)
 
-    def erased_meanwhile(file: BinaryIO, **how: Any) -> Told:
+    def erased_meanwhile(file: BinaryIO, **how: Any) -> ParsedContent:
         with database.writing() as session:
             recordings_of = session.scalars(select(StoredRecording)).all()
             session.execute(text("DELETE FROM recording_chunks"))
             for one in recordings_of:
                 session.delete(one)
-        return read_told(file, **how)
+        return parse_recording(file, **how)
 
     assert stored_recording(database, sha256, erased_meanwhile)
     assert counted(database) == (0, 0)
@@ -330,7 +332,7 @@ def test_a_backup_has_no_cache_and_a_restored_recording_fills_it(database: Datab
     restored = Database(f"sqlite:///{tmp_path / 'r.sqlite'}")
     restore(restored, tmp_path / "b.zip")
     assert counted(restored) == (0, 0)
-    decoded: list[Told] = []
+    decoded: list[ParsedContent] = []
     assert same(stored_recording(restored, sha256, counting(decoded)), stored_recording(database, sha256, never))
     assert len(decoded) == 1 and counted(restored) == (1, 1)
     restored.close()

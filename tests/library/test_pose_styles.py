@@ -16,7 +16,7 @@ from skills.demonstration.partner import PartnerMotion
 from skills.demonstration.recording import Recording
 from skills.errors import Busy, Corrupt, NotFound
 from skills.formats import write_mcap
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import HISTORY, inspect_installation
@@ -285,7 +285,7 @@ def test_a_recording_that_was_erased_meanwhile_is_named(database: Database):
     with database.writing() as session:
         erase_demo(session, demo.sha256, "test")
     with pytest.raises(NotFound, match=r"A demonstration was erased while the training used it\."):
-        training.with_partners(database, read, read_told)
+        training.with_partners(database, read, parse_recording)
 
 
 @pytest.mark.nightly  # by day tests/library/test_backup.py counts every table

@@ -11,7 +11,7 @@ from skills.db.models import ProposalMark
 from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.people.erasure import delete_recording, erase_surgeon
 from skills.library.recordings import proposals
 from skills.library.recordings.demos import withdraw_demo
@@ -139,9 +139,9 @@ def test_who_sees_one_surgeon_sees_their_recordings_and_their_own_uploads(five: 
 
 
 def test_a_small_path_begins_and_ends_where_the_tip_does(five: Database):
-    told = read_told(cases.upload(FIVE.data, MCAP).file)
+    told = parse_recording(cases.upload(FIVE.data, MCAP).file)
     motion, (first, *_) = told.recording.motion_of(), told.proposed
-    drawn = paths_of(five, listed(five, surgeon="kestrel")[0].recording.sha256, read_told)
+    drawn = paths_of(five, listed(five, surgeon="kestrel")[0].recording.sha256, parse_recording)
     assert len(drawn) == 5 and all(len(one) <= proposals.POINTS for one in drawn)
     seconds = told.recording.seconds(motion.stamps_ns)
     inside = motion.tip_mm[(seconds >= first.start_s) & (seconds < first.end_s)]

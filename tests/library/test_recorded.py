@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from skills.library.whose import recognise_recording
 from sqlalchemy.orm import Session
 
 from skills.db.session import Database
 from skills.errors import Conflict
 from skills.formats import write_mcap
-from skills.formats.reader_process import read_told
-from skills.library.comparison.recognition import recognise_recording
+from skills.formats.parsed import parse_recording
 from skills.library.comparison.scores import score
 from skills.library.operation.backup import back_up, erasures_of, restore
 from skills.library.people.catalogue import put_surgeon
@@ -21,7 +21,8 @@ from skills.library.recordings.demos import exported_chunk, exported_recording, 
 from skills.library.recordings.proposals import find_proposal
 from skills.library.recordings.recordings import store_recording
 from skills.library.recordings.timelines import Source, check_export, timeline_of
-from skills.schemas.requests import DatasetIn, ScoreIn
+from skills.schemas.datasets import DatasetIn
+from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
@@ -81,7 +82,7 @@ def shown(database: Database, demo: str) -> set[str]:
     resources: tuple[tuple[Source, str], ...] = (("demos", demo), ("recordings", recording))
     for source, sha256 in resources:
         try:
-            timeline_of(database, source, sha256, read_told)
+            timeline_of(database, source, sha256, parse_recording)
             found.add(source)
         except Conflict:
             continue
@@ -189,14 +190,14 @@ def test_scores_ask_everybody_in_the_recording(database: Database) -> None:
     name_wren(database, demo)
     recording = recording_of(database, demo)
     asked = ScoreIn(surgeon="kestrel", suture=cases.SUTURE, recording=recording, arm="PSM2")
-    assert score(database, asked, read_told).figures
+    assert score(database, asked, parse_recording).figures
     agree(database, "wren", NOTHING)
     with pytest.raises(Conflict, match="does not cover comparisons"):
-        score(database, asked, read_told)
+        score(database, asked, parse_recording)
     with database.writing() as session:
         erase_surgeon(session, "wren", "test")
     with pytest.raises(Conflict, match="does not cover comparisons"):
-        score(database, asked, read_told)
+        score(database, asked, parse_recording)
 
 
 def test_a_recording_of_several_surgeons_is_recognised_as_nobodys(database: Database) -> None:
@@ -205,11 +206,11 @@ def test_a_recording_of_several_surgeons_is_recognised_as_nobodys(database: Data
     sent = cohorts.hand_off(drawn, 0)
     recording = store_recording(database, cases.upload(sent), "test", surgeon="kestrel")[0].sha256
     with pytest.raises(Conflict, match="Several surgeons"):
-        recognise_recording(database, recording, cases.SUTURE, read_told)
+        recognise_recording(database, recording, cases.SUTURE, parse_recording)
     with database.writing() as session:
         erase_surgeon(session, "kestrel", "test")
     with pytest.raises(Conflict, match="Several surgeons"):
-        recognise_recording(database, recording, cases.SUTURE, read_told)
+        recognise_recording(database, recording, cases.SUTURE, parse_recording)
 
 
 def test_a_proposal_is_not_the_others_after_one_of_two_was_erased(database: Database) -> None:

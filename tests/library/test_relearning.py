@@ -15,7 +15,7 @@ from skills.db.models import Demonstration, PolicyVersion, StoredPoses
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import NotFound
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.learning.certificate import NearLimits
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
@@ -77,7 +77,7 @@ def database(filled: Path, tmp_path: Path) -> Iterator[Database]:
 
 def parts(database: Database, **how: Any) -> dict[str, Checked]:
     """Return the parts, as they are at the end."""
-    return {part.what: part for part in inspect_policies(database, read_told, **({"relearn": RELEARN} | how))}
+    return {part.what: part for part in inspect_policies(database, parse_recording, **({"relearn": RELEARN} | how))}
 
 
 def test_versions_of_every_kind_are_learnt_again_as_they_are(database):
@@ -234,7 +234,7 @@ def test_what_was_erased_meanwhile_is_not_called_wrong(database, monkeypatch):
     with pytest.raises(NotFound):
         compute_again(database, 99)
     with pytest.raises(NotFound):
-        decoded(database, 99, read_told)
+        decoded(database, 99, parse_recording)
     monkeypatch.setattr(inspection, "compute_again", lambda database, row: compute_again(database, 99))
     assert parts(database, relearn=None)[CERTIFICATES].wrong == []
 

@@ -20,7 +20,7 @@ from skills.library.policies import batches, retraining
 from skills.library.policies.batches import compare
 from skills.library.policies.training import learn_style
 from skills.library.recordings.demos import withdraw_demo
-from skills.schemas.policies import FitOnTheSame, PolicyFigures
+from skills.schemas.training import FitOnTheSame, PolicyFigures
 from tests.library import cases
 from tests.library.styles import (
     NO_CONSENT,

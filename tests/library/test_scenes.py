@@ -12,21 +12,23 @@ from skills.db.packed import digest, seal, unpack_as
 from skills.db.service_tables import Job
 from skills.errors import BadInput, BadSettings, Conflict, Corrupt
 from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.hazards import Surroundings, hazards_of
 from skills.gridworld.reward import sparse_reward
-from skills.gridworld.scene import Box, Capsule, Scene, Surroundings, Tissue, hazards_of
+from skills.gridworld.scene import Box, Capsule, Scene, Tissue
+from skills.gridworld.slip import slip_model
 from skills.learning.certificate import Coverage, NearLimits, NearOdds, OddsLimits, certify, near_starts
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.in_scene import learn_in_scene
 from skills.learning.policy import Policy
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.learning.slip import FollowPolicy, draw_slips, follows, walk
+from skills.learning.slip_runs import FollowPolicy, follows, walk
 from skills.library.operation.integrity import covered, learnt, scene_digest
 from skills.library.policies import releases
 from skills.library.policies.releases import refusals
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import odds_limits
 from skills.library.policies.versions import about_rollout
-from skills.schemas.requests import RetrainingIn
+from skills.schemas.training import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import ask_retraining, parts_of, styles_of
@@ -79,7 +81,7 @@ def test_the_stored_odds_are_those_of_many_walks_that_slip(database):
     with database.reading() as session:
         policy, odds = learnt(session.merge(version)), covered(session.merge(version))
     for start in (policy.path.start, int(policy.path.grid.states_of([4, 1, 4]))):
-        slips = draw_slips(0.3, runs=3000, moves=400, seed=3)
+        slips = slip_model(0.3).draw(runs=3000, moves=400, seed=3)
         walks = walk(FollowPolicy(policy), policy.path, start, slips, policy.hazards.touches)
         assert follows(walks).mean() == pytest.approx(odds.finishing[start], abs=0.037)  # four standard deviations
         assert walks.touched.mean() == pytest.approx(odds.touching[start], abs=0.037)

@@ -1,5 +1,6 @@
 """Scores on a real database: the reference, the percentiles, the history, and only surgeons with consent."""
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -8,22 +9,24 @@ import pytest
 from skills.db.models import Demonstration, MeasuredShape, StoredCalibration, StoredRecording
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.comparison.calibrations import keep
 from skills.library.comparison.scores import LEAST_DEMOS, progress, score
 from skills.library.people.catalogue import put_surgeon
 from skills.library.recordings.demos import mark_demo, upload_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
 from skills.packing import canonical, sha256
-from skills.schemas.comparison import Score
-from skills.schemas.requests import DemoIn, ScoreIn
+from skills.schemas.demos import DemoIn
+from skills.schemas.scores import Score, ScoreIn
 from skills.scoring.calibration import SkillModel, as_numbers
 from tests.library import cases, rated
 from tests.library.test_calibrations import OLD
-from tests.scoring.test_rating import JUDGED, model
+from tests.scoring.test_rating import JUDGED as RATED
+from tests.scoring.test_rating import model
 
+JUDGED = asdict(RATED)
 NO_ATLAS = {"uses": ["training", "export"]}
-READ = read_told
+READ = parse_recording
 
 
 def put(database: Database, slug: str, **about: object) -> None:

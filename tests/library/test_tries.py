@@ -27,7 +27,7 @@ from skills.library.perform import perform_job
 from skills.library.plans.tries import CELLS_MM, choose_cells, request_try
 from skills.library.recordings.demos import add_demo
 from skills.library.recordings.recordings import store_recording
-from skills.schemas.requests import DemoIn
+from skills.schemas.demos import DemoIn
 from skills.schemas.tries import LOSS_MM, TryIn
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings

@@ -20,7 +20,7 @@ from skills.library.policies.training import request_training
 from skills.library.recordings.demos import mark_demo
 from skills.library.recordings.proposals import decide
 from skills.library.recordings.recordings import store_recording
-from skills.schemas.requests import TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.verification.playback import Pictures
 from tests.library import cases, exports
 from tests.library.styles import ask_retraining, parts_of

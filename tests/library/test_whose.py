@@ -1,13 +1,13 @@
 """Recognition of whole recordings on a real database: with consent, of one surgeon, and without its own session."""
 
 import pytest
+from skills.library.whose import recognise_recording
 from sqlalchemy import select
 
 from skills.db.models import Demonstration
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
-from skills.formats.reader_process import read_told
-from skills.library.comparison.recognition import recognise_recording
+from skills.formats.parsed import parse_recording
 from skills.library.people.catalogue import put_surgeon
 from skills.schemas.comparison import RecognisedRecording
 from tests.comparison.cohort import cohort
@@ -15,7 +15,7 @@ from tests.library import cases, cohorts
 
 
 def recognised(database: Database, recording: str) -> RecognisedRecording:
-    return recognise_recording(database, recording, cases.SUTURE, read_told)
+    return recognise_recording(database, recording, cases.SUTURE, parse_recording)
 
 
 def test_only_recordings_of_one_surgeon_who_agreed_are_compared(database: Database) -> None:

@@ -22,7 +22,7 @@ from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback,
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.demonstration.identification import identify
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
@@ -82,7 +82,7 @@ def made(folder: Path, *, night: bool) -> tuple[dict[str, str], dict[str, Any]]:
     digests, figures = {"scene": scene_digest(SCENE)}, {}
     for name in ("rpy.csv", "vector.csv", "jigsaws.txt", "both 0.mcap", "kestrel 5.mcap"):
         with (folder / name).open("rb") as file:
-            told = read_told(file)
+            told = parse_recording(file)
         digests[f"recording {name}"] = bits(told)
     with np.load(folder / "arm.npz") as arm:
         digests["instrument of joints"] = bits(

@@ -10,7 +10,7 @@ from contextlib import closing
 from pathlib import Path
 
 from skills.db.session import Database
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.operation.inspection import inspect_installation, inspect_policies
 from skills.library.plans.playbacks import request_playback
 from skills.library.plans.replay import replay_bag
@@ -36,7 +36,7 @@ def wrong(database: Database) -> Iterator[str]:
     """Yield what is wrong in a database, and which policies could not be learnt again."""
     for part in {id(one): one for one in inspect_installation(database)}.values():
         yield from (f"{part.what}: {name}: {why}" for name, why in part.wrong)
-    for part in {id(one): one for one in inspect_policies(database, read_told, Settings())}.values():
+    for part in {id(one): one for one in inspect_policies(database, parse_recording, Settings())}.values():
         yield from (f"{part.what}: {name}: {why}" for name, why in (*part.wrong, *part.left_out))
         assert part.count == (part.of or 0)
 

@@ -21,9 +21,9 @@ from sqlalchemy.orm import Session
 import skills.api.app
 import skills.db
 from skills.db.session import Database
-from skills.demonstration.demonstration import Recording
+from skills.demonstration.recording import Recording
 from skills.formats import read_recording
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.people.keys import create_key
 from skills.library.plans import tries
 from skills.library.policies import retraining
@@ -72,7 +72,7 @@ def read_here(file: BinaryIO, *, rate_hz: float | None, frame: str | None, **_wh
     return read_recording(file, rate_hz=rate_hz, frame=frame)
 
 
-read_here.tell = lambda file, *, key="", **how: read_told(file, **how)  # type: ignore[attr-defined]
+read_here.parse = lambda file, *, key="", **how: parse_recording(file, **how)  # type: ignore[attr-defined]
 
 
 @contextmanager
@@ -81,7 +81,7 @@ def in_our_hands() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(skills.db, "datetime", Clock)
         patch.setattr(skills.api.app, "confined_reader", lambda _settings: nullcontext(read_here))
-        patch.setattr(tries, "confined_reader", lambda _settings: SimpleNamespace(server=Deaf(), tell=read_told))
+        patch.setattr(tries, "confined_reader", lambda _settings: SimpleNamespace(server=Deaf(), parse=parse_recording))
         patch.setattr(skills.api.app, "Engine", lambda _settings: Deaf())
         patch.setattr(retraining, "FEWEST_PARTS", 2)
         yield

@@ -20,7 +20,7 @@ import skills.db
 from skills.db.models import Plan, PolicyVersion
 from skills.db.session import Database
 from skills.errors import SkillsError
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.plans.replay import replay_bag
 from skills.library.policies.relearning import StoredRecordings, learn_again
 from skills.settings import Settings
@@ -49,7 +49,7 @@ def seen(url: str) -> dict[str, Any]:
         with database.reading() as session:
             versions = session.execute(select(PolicyVersion.sha256, PolicyVersion.row)).all()
             plans = session.scalars(select(Plan.sha256)).all()
-        recordings = StoredRecordings(database, read_told)
+        recordings = StoredRecordings(database, parse_recording)
         again = {name: learn_again(database, row, recordings, Settings(database_url=url)) for name, row in versions}
         return {
             "differing": {name: list(one.differing) for name, one in again.items()},

@@ -19,7 +19,7 @@ from skills.kinematics import POINTING_DOWN, angle_between, matrix_of, quaternio
 from skills.learning.policy import Policy, Rollout, learn_tabular
 from skills.learning.pose_style import learn_pose_style
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.slip import replay
+from skills.learning.slip_runs import replay
 from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, PsmM, needle_tips_mm, turn
 from skills.planning.path_fit import TREMOR_S, Hand, fit_to_demo, hand_along, styled, trace
 from skills.planning.plan import SuturePoint, departure_of, driven_pass, stack
@@ -61,7 +61,7 @@ def at_home(**given) -> tuple[Trajectory, object]:
     """Return the motion of one pass where the hand was, and its plan."""
     demo, policy = turning()
     plan = stack(policy, [SuturePoint(tuple(demo.tip_mm[-1].tolist()))], demo=demo, **given)
-    motion = time_parametrise(plan.pass_paths, speed_mm_s=plan.speed_mm_s, rate_hz=plan.rate_hz, psm_m=plan.psm_m)
+    motion = time_parametrise(plan.passes, speed_mm_s=plan.speed_mm_s, rate_hz=plan.rate_hz, psm_m=plan.psm_m)
     return motion, plan
 
 
@@ -215,7 +215,7 @@ def test_a_start_off_the_path_approaches_with_the_jaw_it_joins_with():
     held = matrix_of(one.hand.rotation_xyzw[:40])
     assert np.degrees(angle_between(held, held[:1].repeat(40, 0))).max() < 3
     assert matrix_of(one.hand.rotation_xyzw[-1:])[0] == pytest.approx(matrix_of(demo.rotation_xyzw[-1:])[0], abs=1e-8)
-    motion = time_parametrise(plan.pass_paths, rate_hz=RATE_HZ)
+    motion = time_parametrise(plan.passes, rate_hz=RATE_HZ)
     assert motion.speed_ratio <= 1 and motion.acceleration_ratio <= 1
 
 
@@ -223,7 +223,7 @@ def test_positions_alone_keep_the_jaw_and_say_so():
     demo, policy = turning()
     bare = replace(demo, rotation_xyzw=None, jaw_rad=None)
     plan = stack(policy, [SuturePoint(tuple(demo.tip_mm[-1].tolist()))], demo=bare)
-    motion = time_parametrise(plan.pass_paths, rate_hz=RATE_HZ)
+    motion = time_parametrise(plan.passes, rate_hz=RATE_HZ)
     assert (plan.orientation, plan.departure, motion.jaw_rad) == ("assumed tool-down", None, None)
     assert matrix_of(motion.rotation_xyzw) == pytest.approx(np.tile(POINTING_DOWN, (len(motion), 1, 1)), abs=1e-9)
     with pytest.raises(BadPlan, match="no orientation"):
@@ -237,7 +237,7 @@ def test_an_orientation_out_of_reach_is_refused_with_place_and_joint():
     beyond = replace(demo, rotation_xyzw=quaternion_of(turn(POINTING_DOWN, over, part)))
     plan = stack(policy, [SuturePoint(tuple(demo.tip_mm[-1].tolist()))], demo=beyond)
     with pytest.raises(Unreachable, match=r"Pass 0, A1: Sample \d+ at \(.*\) mm") as refused:
-        time_parametrise(plan.pass_paths, rate_hz=RATE_HZ)
+        time_parametrise(plan.passes, rate_hz=RATE_HZ)
     assert refused.value.numbers["joint"]
     assert driven_pass(policy, beyond).beyond > 0
     assert driven_pass(policy, demo).beyond == 0
@@ -302,7 +302,7 @@ def test_the_estimate_of_success_judges_the_recorded_hand_off():
     found = doubt(motion, approach_m=None, pad_top_mm=-170.0, settings=few)
     assert found.hand_offs == 1
     assert found.under[0].passes[0].caught is not None
-    assert openings(motion).max() == pytest.approx(0.2)  # half of the jaw's 0.4 rad
+    assert openings(motion.arms[0]).max() == pytest.approx(0.2)  # half of the jaw's 0.4 rad
 
 
 # ---- several demonstrations, and values -------------------------------------------------------------------------
@@ -344,6 +344,6 @@ def test_a_hand_is_checked():
 
 def test_some_passes_with_a_hand_and_some_without_are_refused():
     _, plan = at_home()
-    (one,) = plan.pass_paths
+    (one,) = plan.passes
     with pytest.raises(BadPlan, match="all passes"):
         time_parametrise([one, replace(one, hand=None)], rate_hz=RATE_HZ)

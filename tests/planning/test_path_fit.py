@@ -17,7 +17,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skills.demonstration.demonstration import Demo, cut_demo, propose_segments
+from skills.demonstration.demonstration import Demo, cut_demo
+from skills.demonstration.segments import propose_segments
 from skills.errors import BadPlan
 from skills.formats import read_recording
 from skills.gridworld.grid import PAPER_GRID, GridPath, GridWorld, discretisation_rmse, discretize

@@ -13,7 +13,7 @@ from skills.learning.policy import rollout, rollout_from
 from skills.planning.handoff import PsmM
 from skills.planning.path_fit import fit_to_demo, trace
 from skills.planning.plan import MAX_OUTSIDE_MM, MAX_PASSES, SuturePoint, pose_xyzw, rotation_of, stack
-from skills.planning.trajectory import PassPath
+from skills.planning.trajectory import time_parametrise
 from tests.by_day import examples
 from tests.gridworld.paths import learnt, named_path
 
@@ -108,10 +108,16 @@ def test_with_psm_ms_approach_the_jaws_normal_ends_parallel_to_it():
     assert stacked([SuturePoint((0, 0, -120))]).passes[0].target_rotation is None
 
 
-def test_a_plan_gives_the_paths_that_take_their_time():
-    plan = stacked([SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))], psm_m=PsmM((1.0, 0, 0)))
-    assert all(isinstance(one, PassPath) for one in plan.pass_paths)
-    assert [one.tip_mm.tolist() for one in plan.pass_paths] == [one.tip_mm.tolist() for one in plan.passes]
+def test_a_plan_is_timed_once_with_its_own_speed_and_rate():
+    plan = stacked(
+        [SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))],
+        psm_m=PsmM((1.0, 0, 0)),
+        rate_hz=100.0,
+        instrument="400006",
+    )
+    asked = {"speed_mm_s": plan.speed_mm_s, "rate_hz": 100.0, "instrument": plan.instrument, "psm_m": plan.psm_m}
+    assert plan.trajectory.joints.tobytes() == time_parametrise(plan.passes, **asked).joints.tobytes()
+    assert plan.trajectory is plan.trajectory
 
 
 # ---- fitted to the demonstration --------------------------------------------------------------------------------
@@ -177,7 +183,7 @@ def test_the_nearest_place_is_worked_by_hand():
     at_home = [SuturePoint(tuple(named_path(NAME).tip_mm[-1]))]
     plan = stacked(at_home, starts_mm=[high + off])
     assert plan.passes[0].tip_mm[0] == pytest.approx(high)
-    assert plan.pass_paths[0].start_mm == pytest.approx(high + off)
+    assert plan.passes[0].start_mm == pytest.approx(high + off)
     with pytest.raises(OutsideGrid, match=r"50\.1 mm from it") as refused:
         stacked(at_home, starts_mm=[high + 1.002 * off])
     assert refused.value.numbers["outside_mm"] == pytest.approx(50.1)

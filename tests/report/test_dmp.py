@@ -5,7 +5,8 @@ import pytest
 from movement_primitives.dmp import DMP
 
 from skills.gridworld.grid import MOVES, discretize
-from skills.learning.slip import STEADY, draw_slips, judge
+from skills.gridworld.slip import STEADY, slip_model
+from skills.learning.slip_runs import judge
 from skills.report.numbers import sample_source
 from skills.report.rivals import REST_TICKS, STEPS, learn_primitive, rollouts, walk_primitive
 
@@ -58,7 +59,7 @@ def test_a_slip_takes_the_place_of_the_tick_s_own_move():
 
 def test_it_never_leaves_the_grid_and_neighbouring_cells_touch():
     corner = PATH.grid.states_of(np.zeros((50, 3), int))
-    walks = walk_primitive(PRIMITIVE, corner, draw_slips(0.5, runs=50, moves=60, seed=2))
+    walks = walk_primitive(PRIMITIVE, corner, slip_model(0.5).draw(runs=50, moves=60, seed=2))
     assert walks.states.min() >= 0
     assert walks.states.max() < PATH.grid.n_states
     steps = np.abs(np.diff(PATH.grid.cells_of(walks.states), axis=0)).max(axis=-1)
@@ -67,7 +68,7 @@ def test_it_never_leaves_the_grid_and_neighbouring_cells_touch():
 
 @pytest.mark.parametrize("slip", [0.05, 0.2])
 def test_pushed_about_it_still_arrives_but_leaves_states_out(slip):
-    slips = draw_slips(slip, runs=100, moves=300, seed=0)
+    slips = slip_model(slip).draw(runs=100, moves=300, seed=0)
     outcome = judge(walk_primitive(PRIMITIVE, np.full(100, PATH.start), slips))
     assert outcome.arrived == 100
     assert outcome.followed < 50

@@ -1,7 +1,6 @@
 """The rating of a trial: a sum by hand, its interval, its terms and thirds, and what it refuses."""
 
-import copy
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,18 +9,21 @@ from skills.errors import BadInput
 from skills.scoring.calibration import PARTS, SkillModel
 from skills.scoring.features import TRIAL_KIND_OF, TRIAL_KINDS, TRIAL_NAMES, TrialFigures
 from skills.scoring.rating import Skill, rate
+from skills.scoring.validation import RIVALS, Chance, Judged, TaskValidation
 
 F = len(TRIAL_NAMES)
 PATH, IDLE = TRIAL_NAMES.index("path_length_mm"), TRIAL_NAMES.index("idle_share")
-JUDGED: dict[str, Any] = {
-    "trials": 40,
-    "surgeons": 8,
-    "model": {"rho": 0.9, "rho_interval": [0.8, 0.95], "accuracy": 0.75},
-    "rivals": {"shorter_first": {"rho": 0.5}, "duration": {"rho": 0.4, "accuracy": 0.5}},
-    "parts": {part: {"rho": 0.5, "rho_interval": [0.1 if part != PARTS[0] else -0.1, 0.9]} for part in PARTS},
-    "chance": {"rho": -0.2, "rho_p": 0.01, "accuracy": 0.2, "accuracy_p": 0.01, "commonest": 0.4},
-    "over_duration": [0.1, 0.6],
-}
+HALF = Judged(0.5, (0.1, 0.9), accuracy=0.5)
+JUDGED = TaskValidation(
+    trials=40,
+    surgeons=8,
+    model=Judged(0.9, (0.8, 0.95), accuracy=0.75),
+    repetition_out=HALF,
+    rivals=dict.fromkeys(RIVALS, HALF),
+    parts=dict.fromkeys(PARTS, HALF) | {PARTS[0]: Judged(0.5, (-0.1, 0.9))},
+    chance=Chance(200, -0.2, rho_p=0.01, accuracy=0.2, accuracy_p=0.01, commonest=0.4),
+    over_duration=(0.1, 0.6),
+)
 
 
 def model(**changed: object) -> SkillModel:
@@ -64,7 +66,7 @@ def trial(path_mm: float, idle: float, *, sides: int = 1, last_idle: float | Non
     return TrialFigures(values, thirds)
 
 
-def rated(found: TrialFigures, by: SkillModel | None = None, judged: dict[str, Any] = JUDGED) -> Skill:
+def rated(found: TrialFigures, by: SkillModel | None = None, judged: TaskValidation = JUDGED) -> Skill:
     return rate(by or model(), "Knot_Tying", found, "0" * 64, judged)
 
 
@@ -108,8 +110,7 @@ def test_what_lies_outside_is_said_in_words_and_the_rating_stays_one() -> None:
 
 
 def test_levels_that_are_refused_are_not_given_and_the_rating_is() -> None:
-    judged = copy.deepcopy(JUDGED)
-    judged["chance"]["accuracy_p"] = 0.5
+    judged = replace(JUDGED, chance=replace(JUDGED.chance, accuracy_p=0.5))
     found = rated(trial(1000.0, 0.2), judged=judged)
     assert found.rating == pytest.approx(18.0) and found.levels is None
     assert "It gives no skill level. Random levels are right as often" in " ".join(found.words)

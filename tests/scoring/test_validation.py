@@ -1,6 +1,6 @@
 """Evidence before words: skill that shows is rated, and what cannot be known is refused, on cohorts of known truth."""
 
-import copy
+import json
 import math
 from dataclasses import asdict, replace
 from typing import Any
@@ -15,8 +15,12 @@ from skills.scoring.validation import (
     ENOUGH,
     LEAST_PERMUTATIONS,
     RIVALS,
+    Chance,
+    Judged,
+    TaskValidation,
     known_parts,
     level_refusals,
+    parse_task,
     refusals,
     shuffled,
     validate,
@@ -25,15 +29,16 @@ from tests.scoring.cohorts import Rule, cohort
 
 
 @pytest.fixture(scope="module")
-def judged() -> dict[str, Any]:
+def judged() -> TaskValidation:
     """Return the figures of a model of a skill that shows."""
-    return asdict(validate(cohort(), permutations=39)[1])["tasks"]["Task_A"]
+    return validate(cohort(), permutations=39)[1].tasks["Task_A"]
 
 
-def test_skill_that_shows_is_found_at_surgeons_left_out(judged: dict[str, Any]) -> None:
-    assert judged["model"]["rho"] > 0.8 and judged["model"]["rho_interval"][0] > 0.6
-    assert judged["repetition_out"]["rho"] > 0.8
-    assert judged["over_duration"][0] > 0 and judged["chance"]["rho_p"] == pytest.approx(1 / 40)
+def test_skill_that_shows_is_found_at_surgeons_left_out(judged: TaskValidation) -> None:
+    assert judged.model.rho > 0.8 and judged.model.rho_interval[0] > 0.6
+    assert judged.repetition_out.rho > 0.8
+    assert judged.over_duration[0] > 0 and judged.chance.rho_p == pytest.approx(1 / 40)
+    assert parse_task(json.loads(json.dumps(asdict(judged)))) == judged
     assert refusals(judged) == level_refusals(judged) == []
     assert len(known_parts(judged)) == 6
 
@@ -101,7 +106,7 @@ def test_shuffling_passes_over_surgeons_without_trials_of_a_task() -> None:
 def accepted(rule: Rule, seeds: range, **size: int) -> int:
     """Return the number of cohorts of which a task is rated."""
     found = (validate(cohort(seed, rule, **size), permutations=39)[1] for seed in seeds)
-    count = sum(any(not refusals(asdict(task)) for task in one.tasks.values()) for one in found)
+    count = sum(any(not refusals(task) for task in one.tasks.values()) for one in found)
     print(f"{rule}: {count} of {len(seeds)} accepted")
     return count
 
@@ -127,7 +132,7 @@ def dealt_and_rated(seeds: range) -> int:
         order = shuffled(drawn, np.random.default_rng([seed, 2]))
         dealt = replace(drawn, ratings=drawn.ratings[order], levels=drawn.levels[order])
         found = validate(dealt, seed=seed, permutations=LEAST_PERMUTATIONS)[1]
-        count += any(not refusals(asdict(task)) for task in found.tasks.values())
+        count += any(not refusals(task) for task in found.tasks.values())
     print(f"{count} of {len(seeds)} shuffles rated")
     return count
 
@@ -172,40 +177,44 @@ def test_of_fifty_cohorts_of_the_stated_size_nine_tenths_are_rated() -> None:
         ("model", "accuracy", math.nan, "in nan % of the trials"),
         (None, "over_duration", [0.0, 0.4], "no better than the duration alone"),
         (None, "over_duration", [math.nan, 0.4], "no better than the duration alone"),
-        (None, "over_duration", None, "no better than the duration alone"),
     ],
 )
 def test_each_comparison_can_refuse_and_nan_does(
-    part: str | None, field: str, wrong: Any, said: str, judged: dict[str, Any]
+    part: str | None, field: str, wrong: Any, said: str, judged: TaskValidation
 ) -> None:
-    spoilt = copy.deepcopy(judged) | {"surgeons": 100}
-    of = spoilt if part is None else spoilt[part]
-    if wrong is None:
-        del of[field]
-    else:
-        of[field] = wrong
+    changed: dict[str, Any] = {field: wrong}
+    if part is not None:
+        changed = {part: replace(getattr(judged, part), **changed)}
+    spoilt = replace(judged, surgeons=100, **changed)
     of_levels = "accuracy" in field
     assert (refusals(spoilt) == []) == of_levels
     why = level_refusals(spoilt) if of_levels else refusals(spoilt)
     assert len(why) == 1 and said in why[0]
 
 
-def test_a_model_without_any_figure_is_refused_in_words() -> None:
-    why = refusals({})
+def test_a_model_without_any_figure_is_refused_with_sentences() -> None:
+    none = Judged(math.nan, (math.nan, math.nan))
+    nothing = replace(of_p(0, 39), surgeons=0, model=none, rivals=dict.fromkeys(RIVALS, none))
+    nothing = replace(nothing, chance=Chance(39, math.nan, math.nan), over_duration=none.rho_interval)
+    why = refusals(nothing)
     assert len(why) == 4 and "about 40 with 5 trials each are needed" in why[3]
-    assert len(level_refusals({})) == 2
+    assert len(level_refusals(nothing)) == 2
 
 
-def of_p(as_good: int, permutations: int) -> dict[str, Any]:
+def of_p(as_good: int, permutations: int) -> TaskValidation:
     """Return the figures of an excellent model, with p from the permutations that do as well."""
     p = (1 + as_good) / (1 + permutations)
-    return {
-        "surgeons": 40,
-        "model": {"rho": 0.9, "rho_interval": (0.8, 0.95), "accuracy": 0.9},
-        "rivals": {"duration": {"rho": 0.1, "accuracy": 0.3}},
-        "chance": {"permutations": permutations, "rho": 0.0, "rho_p": p, "accuracy_p": p, "commonest": 0.4},
-        "over_duration": (0.5, 0.8),
-    }
+    excellent, poor = Judged(0.9, (0.8, 0.95), accuracy=0.9), Judged(0.1, (0.0, 0.2), accuracy=0.3)
+    return TaskValidation(
+        trials=200,
+        surgeons=40,
+        model=excellent,
+        repetition_out=excellent,
+        rivals=dict.fromkeys(RIVALS, poor),
+        parts={},
+        chance=Chance(permutations, 0.0, rho_p=p, accuracy_p=p, commonest=0.4),
+        over_duration=(0.5, 0.8),
+    )
 
 
 @pytest.mark.parametrize(

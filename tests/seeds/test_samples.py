@@ -5,7 +5,8 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from skills.demonstration.demonstration import cut_demo, propose_segments
+from skills.demonstration.demonstration import cut_demo
+from skills.demonstration.segments import propose_segments
 from skills.formats import read_recording
 from skills.seeds.recordings import sample_recordings
 

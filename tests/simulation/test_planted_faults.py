@@ -23,11 +23,12 @@ from skills.packing import canonical
 from skills.planning import handoff
 from skills.planning.handoff import OtherArm
 from skills.planning.trajectory import A1, PassPath, Trajectory, time_parametrise
-from skills.schemas.requests import DemoIn, Reading
+from skills.schemas.demos import DemoIn
+from skills.schemas.recordings import Reading
 from skills.settings import Settings
 from skills.simulation.player import play
+from skills.verification.deviations import LIMITS
 from skills.verification.gates import Limits
-from skills.verification.intent import LIMITS
 from skills.verification.verdict import PlaybackReport, judge
 from tests import backends
 from tests.bench.playing import stacked

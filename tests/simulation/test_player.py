@@ -12,11 +12,11 @@ from skills.db.packed import digest
 from skills.errors import BadInput, SimulationFailed
 from skills.kinematics import POINTING_DOWN
 from skills.planning.handoff import OtherArm
-from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
+from skills.planning.trajectory import PSM_M, PassPath, Trajectory, time_parametrise
 from skills.simulation import simulator
 from skills.simulation.player import default_pad_top, play
 from skills.verification.gates import Limits
-from skills.verification.playback import PSM_M, Playback
+from skills.verification.playback import Playback
 from skills.verification.verdict import judge
 from tests.bench.playing import stacked
 from tests.by_day import some

@@ -13,9 +13,9 @@ from PIL import Image
 
 from skills.kinematics import CLASSIC, JOINTS
 from skills.planning.handoff import PsmM
-from skills.planning.trajectory import A2, TRANSFER, Trajectory, time_parametrise
+from skills.planning.trajectory import A2, PSM_A, TRANSFER, Trajectory, time_parametrise
 from skills.simulation import pictures
-from skills.verification.playback import PAD, PSM_A, Playback, link_pairs
+from skills.verification.playback import PAD, Playback, link_pairs
 from tests.planning.motions import PSM_M, hand_off, ideal_playback, small_trajectory
 
 if TYPE_CHECKING:

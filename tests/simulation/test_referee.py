@@ -11,8 +11,8 @@ from skills.kinematics import matrix_of, quaternion_of
 from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, JAW_S, OPEN_RAD, TAKEN_MM
 from skills.simulation import referee as refereeing
 from skills.simulation.referee import Physics, Refereed, referee
-from skills.verification.arm_errors import draw, rotation_of
 from skills.verification.clearance import RADIUS_MM, needle_poses, psm_m_poses
+from skills.verification.error_draws import draw, rotation_of
 from skills.verification.probabilities import DoubtSettings
 from tests.arms import ARMS, EXACT
 from tests.needs import need

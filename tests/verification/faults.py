@@ -14,8 +14,9 @@ from skills.kinematics import forward, inverse, matrix_of, quaternion_of
 from skills.planning.handoff import JAW_S, OtherArm, PsmM
 from skills.planning.plan import SuturePlan, SuturePoint, stack
 from skills.planning.trajectory import A2, TRANSFER, PassPath, Trajectory, time_parametrise
-from skills.verification.asked import Asked, asked_of
-from skills.verification.intent import LIMITS, IntentComparison, compare
+from skills.verification.deviations import LIMITS, Deviations
+from skills.verification.intent import compare
+from skills.verification.requested import RequestedMotion, requested_motion
 from tests.planning.motions import PSM_M
 from tests.planning.test_hand import turning
 from tests.verification.hands import BASE_MM, BASE_XYZW, about
@@ -79,11 +80,11 @@ Faults = Mapping[str, tuple[Fault, str, int]]  # by name: the fault, its kind, a
 
 
 @cache
-def sound(a2: str = "paper", orientation: str | None = None) -> tuple[Asked, Trajectory]:
+def sound(a2: str = "paper", orientation: str | None = None) -> tuple[RequestedMotion, Trajectory]:
     """Return a sound plan with both arms, and its motion."""
     plan = planned(a2, orientation)
     demo, policy = turning()
-    return asked_of(plan, policy, demo), timed(plan.pass_paths, plan.psm_m)
+    return requested_motion(plan, policy, demo), timed(plan.passes, plan.psm_m)
 
 
 @cache
@@ -147,7 +148,7 @@ def stands(trajectory: Trajectory) -> np.ndarray:
     return still
 
 
-def broken(comparison: IntentComparison) -> tuple[str, int] | None:
+def broken(comparison: Deviations) -> tuple[str, int] | None:
     """Return the kind and the sample of the earliest deviation beyond its limit."""
     found = []
     for kind, values in comparison.values.items():

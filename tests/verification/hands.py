@@ -111,7 +111,7 @@ def random_plan(rng: np.random.Generator, demo: Demo, policy: Policy) -> Planned
         a2="paper" if rng.random() < 0.3 else None,
     )
     asked = {"speed_mm_s": plan.speed_mm_s, "rate_hz": plan.rate_hz, "instrument": plan.instrument}
-    return Planned(policy, demo, plan, time_parametrise(plan.pass_paths, psm_m=plan.psm_m, **asked))
+    return Planned(policy, demo, plan, time_parametrise(plan.passes, psm_m=plan.psm_m, **asked))
 
 
 def random_psm_m(rng: np.random.Generator, seen: Partner | None) -> PsmM | None:

@@ -13,21 +13,11 @@ from pydantic import ValidationError
 from skills.errors import BadInput, BadSettings
 from skills.kinematics import forward
 from skills.library.plans.arm_errors import stated_errors
-from skills.schemas.plans import PlaybackIn
+from skills.schemas.playbacks import PlaybackIn
 from skills.settings import Settings
-from skills.verification.arm_errors import (
-    CALIBRATED,
-    CALLED,
-    LEAST_EFFECTIVE,
-    NAMED,
-    SIZES,
-    UNCALIBRATED,
-    ArmErrors,
-    MeasuredArm,
-    calibrate_arm,
-    effective_number,
-    rotation_of,
-)
+from skills.verification.arm_calibration import LEAST_EFFECTIVE, MeasuredArm, calibrate_arm, effective_number
+from skills.verification.arm_errors import CALIBRATED, CALLED, NAMED, SIZES, UNCALIBRATED, ArmErrors
+from skills.verification.error_draws import rotation_of
 from tests.arms import ARMS
 
 PLAN = "0" * 64

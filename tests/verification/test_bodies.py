@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from skills.kinematics import instrument_of, matrix_of
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.trajectory import A1, Trajectory, time_parametrise
-from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, draw
+from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
 from skills.verification.bodies import (
     BODIES,
     LOOK_MM,
@@ -24,6 +24,7 @@ from skills.verification.bodies import (
     too_near,
 )
 from skills.verification.clearance import links_of
+from skills.verification.error_draws import draw
 from skills.verification.gates import Limits
 from skills.verification.monte_carlo import doubt, scene_of
 from skills.verification.probabilities import DoubtSettings

@@ -15,7 +15,8 @@ import pytest
 
 from skills.kinematics import instrument_of, matrix_of
 from skills.planning.trajectory import Trajectory
-from skills.verification.bodies import Parts, between, bodies_clearance, distances_at, parts_of, radii_of
+from skills.verification.bodies import between, bodies_clearance, distances_at, parts_of, radii_of
+from skills.verification.clearance import Links
 from tests.needs import need
 from tests.verification.hands import sound_plans
 
@@ -32,7 +33,7 @@ NEAR_MM = 2.0
 class SetUp:
     """Two arms in one pose each, in one frame, and the least distance between them in closed form."""
 
-    parts: tuple[Parts, Parts]
+    parts: tuple[Links, Links]
     radii: tuple[np.ndarray, np.ndarray]
     least_mm: float
 
@@ -65,7 +66,7 @@ def set_up(number: int) -> SetUp:
     return SetUp((arms[0], arms[1].seen_from(base, share * way)), radii, least(share))
 
 
-def capsules(parts: Parts, radii: np.ndarray) -> list[fcl.CollisionObject]:
+def capsules(parts: Links, radii: np.ndarray) -> list[fcl.CollisionObject]:
     found = []
     for begin, end, radius in zip(parts.begin_mm[0], parts.end_mm[0], radii, strict=True):
         way = end - begin

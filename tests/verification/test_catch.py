@@ -8,7 +8,7 @@ import pytest
 
 from skills.kinematics import JAW_TIP_MM, POINTING_DOWN
 from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, hand_off, realign
-from skills.verification.arm_errors import MEAN_LENGTH, Drawn, draw
+from skills.verification.arm_errors import MEAN_LENGTH
 from skills.verification.clearance import (
     FINGER_RADIUS_MM,
     NEEDLE_FREE_RAD,
@@ -17,6 +17,7 @@ from skills.verification.clearance import (
     HandOff,
     catch,
 )
+from skills.verification.error_draws import Drawn, draw
 
 APPROACH = (-0.94, 0.10, -0.33)
 OPENING_RAD = radians(30)

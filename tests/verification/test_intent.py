@@ -23,9 +23,10 @@ from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER, PassPath, Trajectory
 from skills.verification import intent
 from skills.verification.arm_errors import UNCALIBRATED
-from skills.verification.asked import asked_of
-from skills.verification.intent import LIMITS, compare
+from skills.verification.deviations import LIMITS
+from skills.verification.intent import compare
 from skills.verification.playback import Playback
+from skills.verification.requested import requested_motion
 from skills.verification.scene_clearance import clearance_of
 from skills.verification.verdict import judge, judge_plan
 from tests.planning.motions import PSM_M, ideal_playback
@@ -60,7 +61,7 @@ def test_a_pass_that_ends_with_a_place_beyond_the_hinge_does_not_deviate():
     demo, policy = turning()
     point, psm_m = SuturePoint(tuple((demo.tip_mm[-1] - [0.0, 0.0, 10.2]).tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0, tip_offset_mm=10.2)
-    asked, motion = asked_of(plan, policy, demo), timed(plan.pass_paths, psm_m)
+    asked, motion = requested_motion(plan, policy, demo), timed(plan.passes, psm_m)
     assert broken(compare(asked, motion)) is None
     nearer = replace(asked, tip_offset_mm=10.0)
     assert broken(compare(nearer, motion)) is not None
@@ -126,7 +127,7 @@ def ideal(trajectory: Trajectory) -> Playback:
 
 def planned_wrongly(change: Callable[[PassPath], PassPath]) -> Trajectory:
     """Return the motion of the sound plan with its middle pass changed before it is timed, PSM_A's alone."""
-    passes = [*planned().pass_paths]
+    passes = [*planned().passes]
     passes[1] = change(passes[1])
     return timed(passes, PsmM(PSM_M))
 
@@ -217,7 +218,7 @@ def test_cells_reach_as_far_as_hysteresis_and_a_path_farther_out_is_named(hyster
     point = SuturePoint(tuple(demo.tip_mm[-1].tolist()))
     psm_m = PsmM(PSM_M, BASE_MM, BASE_XYZW)
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
-    asked, sound_motion = asked_of(plan, policy, demo), timed(plan.pass_paths, plan.psm_m)
+    asked, sound_motion = requested_motion(plan, policy, demo), timed(plan.passes, plan.psm_m)
     assert compare(asked, sound_motion).values[kind].max() < 0.05  # bends are rounded off by the arm
     for bent_mm, named in ((7.0, False), (12.0, True)):
         motion = poses(sound_motion)
@@ -245,7 +246,7 @@ def test_a_start_beside_the_demonstrated_one_goes_by_the_clock_of_its_end():
     point, psm_m = SuturePoint(tuple(demo.tip_mm[-1].tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     start = demo.tip_mm[0] + 0.1 * X
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, starts_mm=[start], rate_hz=RATE_HZ, speed_mm_s=20.0)
-    assert broken(compare(asked_of(plan, policy, demo), timed(plan.pass_paths, psm_m))) is None
+    assert broken(compare(requested_motion(plan, policy, demo), timed(plan.passes, psm_m))) is None
 
 
 def test_a_sound_motion_is_feasible_with_its_intent_and_without():
@@ -258,11 +259,11 @@ def test_the_verdict_on_a_plan_has_its_request_scene_and_inexact_worlds():
     demo, policy = turning()
     point, psm_m = SuturePoint(tuple(demo.tip_mm[-1].tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
-    motion = timed(plan.pass_paths, psm_m)
+    motion = timed(plan.passes, psm_m)
     low_mm = float(motion.tip_mm[:, 2].min()) - 30.0
     plan = replace(plan, scene=Scene(plan.frame, tissue=Tissue.plane((0.0, 0.0, low_mm), (0.0, 0.0, 1.0))))
     verdict = judge_plan(plan, motion, ideal(motion), policy=policy, demo=demo)
-    beside, apart = clearance_of(motion, plan.scene), compare(asked_of(plan, policy, demo), motion)
+    beside, apart = clearance_of(motion, plan.scene), compare(requested_motion(plan, policy, demo), motion)
     assert verdict.report == judge(ideal(motion), motion, beside=beside, pad_is_tissue=False, intent=apart)
     assert verdict.report.feasible and verdict.failure_in_words is None
     assert verdict.scene == beside.report
@@ -278,7 +279,9 @@ def test_the_verdict_on_a_plan_has_its_request_scene_and_inexact_worlds():
 
 def refused(one: Planned) -> str | None:
     """Return why a plan is refused, if it is."""
-    report = judge(ideal(one.trajectory), one.trajectory, intent=compare(asked_of(one.plan, *one[:2]), one.trajectory))
+    report = judge(
+        ideal(one.trajectory), one.trajectory, intent=compare(requested_motion(one.plan, *one[:2]), one.trajectory)
+    )
     return None if report.failure is None else str(report.failure)
 
 

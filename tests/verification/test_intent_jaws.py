@@ -9,8 +9,8 @@ from skills.kinematics import instrument_of
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER
-from skills.verification.asked import asked_of
 from skills.verification.intent import compare
+from skills.verification.requested import requested_motion
 from tests.planning.motions import PSM_M
 from tests.planning.test_hand import turning
 from tests.verification.faults import (
@@ -148,7 +148,7 @@ def test_a_jaw_that_was_not_recorded_stays_closed_in_a1():
     bare, psm_m = replace(demo, jaw_rad=None), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     point = SuturePoint(tuple(demo.tip_mm[-1].tolist()))
     plan = stack(policy, [point], demo=bare, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
-    asked, motion = asked_of(plan, policy, bare), poses(timed(plan.pass_paths, psm_m))
+    asked, motion = requested_motion(plan, policy, bare), poses(timed(plan.passes, psm_m))
     assert broken(compare(asked, motion.built())) is None
     rows = motion.rows(A1, 0)[300:]
     motion.jaw[rows] += 0.01
@@ -166,7 +166,7 @@ def test_an_arm_that_slips_at_the_last_moment_was_not_standing_still():
 
 def test_a_jaw_without_psm_m_stays_between_its_angles_around_a_transfer():
     asked, psm_m = replace(sound()[0], psm_m=PsmM(PSM_M)), PsmM(PSM_M)
-    motion = timed(planned().pass_paths, psm_m)
+    motion = timed(planned().passes, psm_m)
     assert broken(compare(asked, motion)) is None
     opened, rows = np.array(motion.jaw_rad), np.flatnonzero((motion.pass_index == 1) & (motion.phase == TRANSFER))
     opened[rows] = min(opened[rows[0] - 1], opened[rows[-1] + 1]) - 0.1

@@ -5,9 +5,9 @@ import pytest
 
 from skills.kinematics import quaternion_of
 from skills.planning.trajectory import A1, A2, TRANSFER
-from skills.verification.asked import Asked
 from skills.verification.clearance import stands_from
 from skills.verification.intent import compare
+from skills.verification.requested import RequestedMotion
 from tests.planning.motions import PSM_M
 from tests.verification.faults import (
     Fault,
@@ -240,7 +240,7 @@ def test_a_rollout_that_joins_later_goes_by_the_clock_of_its_end(monkeypatch):
     asked, motion = sound()
     changed = poses(motion)
     stall(A1, 0, 0.2)(changed)
-    monkeypatch.setattr(Asked, "joined_s", lambda _asked, _states: (0.5, 0.9))
+    monkeypatch.setattr(RequestedMotion, "joined_s", lambda _asked, _states: (0.5, 0.9))
     assert not compare(asked, changed.built()).values["clock of A1 off the recording's"].any()
 
 

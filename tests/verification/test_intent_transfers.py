@@ -6,8 +6,9 @@ import pytest
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import A1, TRANSFER
-from skills.verification.asked import asked_of
-from skills.verification.intent import LIMITS, compare
+from skills.verification.deviations import LIMITS
+from skills.verification.intent import compare
+from skills.verification.requested import requested_motion
 from tests.planning.motions import PSM_M
 from tests.planning.test_hand import turning
 from tests.verification.faults import (
@@ -86,7 +87,7 @@ def test_in_the_first_transfer_the_jaw_may_turn_evenly():
     point, psm_m = SuturePoint(tuple(demo.tip_mm[-1].tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     start = np.array(policy.path.grid.origin_mm) - 10.0
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, starts_mm=[start], rate_hz=RATE_HZ, speed_mm_s=20.0)
-    asked, motion = asked_of(plan, policy, demo), poses(timed(plan.pass_paths, psm_m))
+    asked, motion = requested_motion(plan, policy, demo), poses(timed(plan.passes, psm_m))
     rows = motion.rows(TRANSFER, 0)
     turn(motion.turned, rows, X, np.linspace(10.0, 0.0, len(rows) + 1)[:-1])
     assert 10.0 / len(rows) > LIMITS["transfer leaves the shorter way"][1] / 2

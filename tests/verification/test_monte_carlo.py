@@ -16,7 +16,7 @@ from skills.kinematics import JAW_TIP_MM, POINTING_DOWN, matrix_of
 from skills.planning.handoff import HOLDING_RAD, JAW_CLOSED_RAD, JAW_OPEN_RAD, NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification import monte_carlo, probabilities
-from skills.verification.arm_errors import CALIBRATED, MEAN_LENGTH, SIZES, UNCALIBRATED, ArmErrors, Displaced, draw
+from skills.verification.arm_errors import CALIBRATED, MEAN_LENGTH, SIZES, UNCALIBRATED, ArmErrors
 from skills.verification.clearance import (
     FINGER_RADIUS_MM,
     NEEDLE_FREE_RAD,
@@ -25,6 +25,7 @@ from skills.verification.clearance import (
     clearance_to_pad,
     links_of,
 )
+from skills.verification.error_draws import Displaced, draw
 from skills.verification.gates import Limits
 from skills.verification.monte_carlo import doubt, looked_at, scene_of
 from skills.verification.probabilities import Doubt, DoubtSettings, DoubtUnder

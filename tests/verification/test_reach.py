@@ -63,7 +63,7 @@ def styles(seed: int) -> Iterator[tuple[Asked, np.random.Generator]]:
 def planned(plan: SuturePlan) -> Trajectory | None:
     """Return the motion of a plan; None where planning refuses it."""
     try:
-        return time_parametrise(plan.pass_paths, psm_m=plan.psm_m, rate_hz=200.0, instrument=plan.instrument)
+        return time_parametrise(plan.passes, psm_m=plan.psm_m, rate_hz=200.0, instrument=plan.instrument)
     except (Unreachable, BadSpeed):
         return None
 
@@ -87,7 +87,7 @@ def refused(plan: SuturePlan) -> str | None:
         m = motion.psm_m
         other = links_of(m.joints, m.instrument).seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm)
         apart = clearance_between(links_of(motion.joints, motion.instrument), other)
-        apart[:, FINGERS] -= FINGER_REACH_MM * (openings(motion)[:, None, None] - HOLDING_RAD)
+        apart[:, FINGERS] -= FINGER_REACH_MM * (openings(motion.arms[0])[:, None, None] - HOLDING_RAD)
         still = (np.abs(np.diff(motion.tip_mm, axis=0)) < 1e-9).all(axis=1) & (np.diff(m.joints, axis=0) == 0).all(
             axis=1
         )

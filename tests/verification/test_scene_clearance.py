@@ -8,7 +8,7 @@ import pytest
 from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.kinematics import matrix_of
 from skills.planning.handoff import HOLDING_RAD, NEEDLE_RADIUS_MM, OPEN_RAD
-from skills.planning.trajectory import A1, A2
+from skills.planning.trajectory import A1, A2, PSM_A, PSM_M
 from skills.verification.bodies import parts_of, radii_of
 from skills.verification.clearance import (
     RADII_MM,
@@ -21,13 +21,13 @@ from skills.verification.clearance import (
     travel_mm,
 )
 from skills.verification.gates import SCENE
-from skills.verification.playback import CLEARANCE_SEEN_MM, PSM_A, PSM_M
+from skills.verification.playback import CLEARANCE_SEEN_MM
 from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of, flat_tissue, needle_from_tissue
 from skills.verification.verdict import judge
 from tests.planning.motions import ideal_playback
 from tests.verification.test_playback import TRAJECTORY, beside, with_psm_m
 
-ARM = links_of(TRAJECTORY.joints, TRAJECTORY.instrument, openings(TRAJECTORY))
+ARM = links_of(TRAJECTORY.joints, TRAJECTORY.instrument, openings(TRAJECTORY.arms[0]))
 LOWEST = (np.minimum(ARM.begin_mm[..., 2], ARM.end_mm[..., 2]) - RADII_MM).min(axis=1)  # of each sample
 
 STEP_MM = float(travel_mm(TRAJECTORY.joints, TRAJECTORY.instrument).max())  # in one step, at only 60 Hz

@@ -6,8 +6,8 @@ from math import cos, radians, sin, sqrt
 import numpy as np
 import pytest
 
+from skills.arithmetic import wilson
 from skills.kinematics import POINTING_DOWN
-from skills.learning.slip import wilson
 from skills.planning.handoff import realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification.arm_errors import MEAN_LENGTH, SIZES, ArmErrors

@@ -33,8 +33,8 @@ from skills.gridworld import paper
 from skills.gridworld.grid import GridPath, discretisation_rmse
 from skills.learning.certificate import Coverage
 from skills.library.policies.cards import Card
-from skills.schemas.comparison import CurvePoint
-from skills.schemas.given import Atlas
+from skills.schemas.comparison import Atlas
+from skills.schemas.scores import CurvePoint
 from skills.scoring.deviation import Deviation
 
 Report = Mapping[str, Any]

@@ -29,7 +29,8 @@ from skills.library.recordings.demos import find_demo, shown_demo
 from skills.library.recordings.recordings import find_recording
 from skills.planning.handoff import Enters
 from skills.remedies import Door
-from skills.schemas.requests import DIGEST, ScoreIn
+from skills.schemas.requests import DIGEST
+from skills.schemas.scores import ScoreIn
 from skills.settings import MEBIBYTE
 
 # Statuses of errors that are shown as a page; all others are 404.

@@ -33,9 +33,9 @@ from skills.api.dependencies import (
 from skills.api.openapi import gives, gives_file, gives_page, makes, router_of, says, starts_job
 from skills.api.pages import render
 from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
-from skills.api.routes.demos import RAW_BODY
 from skills.api.routes.pages import PageRoute
 from skills.api.routes.policies import Accept
+from skills.api.routes.recordings import RAW_BODY
 from skills.db.session import Database
 from skills.errors import UnknownFormat
 from skills.fields import as_json
@@ -58,20 +58,14 @@ from skills.library.plans.replay import compare_with_plan, conditions_of, replay
 from skills.library.recordings.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
-from skills.schemas.given import Page, SuturePoints
-from skills.schemas.plans import (
-    Comparison,
-    MotionTimeline,
-    Plan,
-    PlanIn,
-    PlanSummary,
-    Playback,
-    PlaybackIn,
-    Reach,
-    ReachIn,
-)
+from skills.schemas import Page
+from skills.schemas.plans import Plan, PlanIn, PlanSummary
 from skills.schemas.plans import Trajectory as GivenTrajectory
+from skills.schemas.playbacks import Comparison, Playback, PlaybackIn
+from skills.schemas.reach import Reach, ReachIn
+from skills.schemas.recordings import SuturePoints
 from skills.schemas.requests import DIGEST, FRAME, Name, Schema
+from skills.schemas.timelines import MotionTimeline
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures
 

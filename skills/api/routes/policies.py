@@ -63,21 +63,15 @@ from skills.library.policies.releases import outcomes_of, outcomes_of_styles
 from skills.library.policies.retraining import find_retraining, list_styles, request_retraining, retrained_json
 from skills.library.policies.training import near_limits, odds_limits, request_training
 from skills.library.policies.versions import about_next, poses_of, summary_json, version_json
-from skills.schemas.given import (
-    Job,
-    NextPose,
-    NextStep,
-    Page,
-    Policy,
-    PolicyCard,
-    PolicySummary,
-    PoseStyle,
-    Retraining,
-    Rollout,
-    SignedEnvelope,
-)
-from skills.schemas.given import Version as GivenVersion
-from skills.schemas.requests import JOB, SLUG, NextIn, RetrainingIn, RolloutIn, TrainingIn
+from skills.schemas import Page
+from skills.schemas.cards import PolicyCard
+from skills.schemas.given import SignedEnvelope
+from skills.schemas.operation import Job
+from skills.schemas.policies import NextStep, Policy, PolicySummary, Rollout, RolloutIn
+from skills.schemas.policies import Version as GivenVersion
+from skills.schemas.pose_styles import NextIn, NextPose, PoseStyle
+from skills.schemas.requests import JOB, SLUG
+from skills.schemas.training import Retraining, RetrainingIn, TrainingIn
 from skills.schemas.tries import TryIn
 from skills.settings import MEBIBYTE
 from skills.transparency import read_notes

@@ -16,9 +16,8 @@ setpoints among them, are optional: one that cannot be used is omitted, and `lef
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -37,25 +36,16 @@ from skills.demonstration.recording import (
 )
 from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats import topics
-from skills.formats.mcap.cdr import (
-    WANTED_POSE,
-    Columns,
-    Decoder,
-    Field,
-    Taken,
-    Wanted,
-    decode_together,
-    fields_of,
-    joined,
-)
-from skills.formats.mcap.reader import MAGIC, Channel, MessageSchema, Part, Stretch, Walker
+from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Field, Wanted, fields_of
+from skills.formats.mcap.reader import MAGIC, Channel, MessageSchema, Part, Walker
 from skills.formats.mcap.records import RECOVER
 from skills.formats.topics import Meaning, TopicKind
+from skills.kinematics import INSERTION
 
 __all__ = ["MAGIC", "NeedsRosbags", "read_mcap"]
 
 TOOL_LIMIT = 200  # characters of an instrument's name
-_INSERTION = 2  # the PSM's only prismatic joint
+MeaningOf = Callable[[str, str], Meaning | None]  # of a topic and its message type
 
 _POSITION = Wanted(("position",), first=True)
 _ANGLES = (TopicKind.JAW, TopicKind.GRIPPER, TopicKind.JAW_SETPOINT)  # continuous values, the first of a joint state
@@ -78,11 +68,12 @@ class NeedsRosbags(UnreadableRecording):
     """A valid file with message types that only rosbags can read; `numbers["integrity"]` is the file's integrity."""
 
 
-def read_mcap(file: BinaryIO) -> Recording:
+def read_mcap(file: BinaryIO, meaning: MeaningOf = topics.meaning) -> Recording:
     """Read the used topics of a dVRK recording.
 
     Args:
         file: The MCAP file, at its beginning.
+        meaning: Returns what a topic of a message type means; a topic without a meaning is not read.
 
     Returns:
         The recording, in millimetres.
@@ -94,7 +85,7 @@ def read_mcap(file: BinaryIO) -> Recording:
         MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
     """
     try:
-        return _recording(_read_log(file))
+        return _recording(_read_log(file, meaning))
     except (SkillsError, MemoryError):
         raise
     except Exception as error:  # on a damaged file a parser may raise anything
@@ -107,14 +98,7 @@ class _Topic:
 
     name: str
     meaning: Meaning
-    parts: list[Columns | Taken] = field(default_factory=list)
-
-    @cached_property
-    def columns(self) -> list[Columns]:
-        """All messages as columns; read it when the topic is complete, because the parts are released."""
-        columns = joined(self.parts)
-        self.parts.clear()
-        return columns
+    columns: list[Columns] = field(default_factory=list)
 
     @property
     def is_needed(self) -> bool:
@@ -127,6 +111,7 @@ class _Log:
     """The contents of a file, decoded part by part; only messages of used topics are stored."""
 
     walker: Walker
+    meaning_of: MeaningOf
     topics: dict[str, _Topic] = field(default_factory=dict)
     decoders: dict[int, Decoder | None] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
@@ -135,16 +120,13 @@ class _Log:
 
     def take(self, part: Part) -> None:
         """Decode the messages of a part whose topics are used, and store them."""
-        channels = [self.walker.channels[number] for number in part.numbers]
-        used = {channel.number: decoder for channel in channels if (decoder := self._decoder_of(channel)) is not None}
-        together = decode_together(used, part.data, part.chain)
-        for number, decoder in used.items():
+        for number in part.numbers:
             channel = self.walker.channels[number]
-            topic = self.topics[channel.topic]
-            if topic.name in self.left_out:  # omitted in this loop, by another channel of the same topic
+            if (decoder := self._decoder_of(channel)) is None:
                 continue
+            topic, messages = self.topics[channel.topic], part.of(channel)
             try:
-                topic.parts.append(together[number] if number in together else _alone(decoder, part.of(channel)))
+                topic.columns.append(decoder.decode(messages.data, messages.begin, messages.length))
             except SkillsError as error:
                 self.leave_out(topic, error)
 
@@ -159,7 +141,7 @@ class _Log:
         if topic.is_needed:
             raise error
         self.left_out[topic.name] = str(error)
-        topic.parts.clear()
+        topic.columns.clear()
 
     def type_of(self, channel: Channel) -> str:
         """Return the message type of a channel; "" for a channel without schema."""
@@ -168,7 +150,7 @@ class _Log:
     def _decoder(self, channel: Channel) -> Decoder | None:
         """Create the decoder of a channel; None if the channel is not used, or its types are in IDL."""
         message_type = _ros2_name(self.type_of(channel))
-        meaning = topics.meaning(channel.topic, message_type)
+        meaning = self.meaning_of(channel.topic, message_type)
         if meaning is None:
             return None
         schema = self.walker.schemas[channel.schema]
@@ -187,12 +169,8 @@ class _Log:
             return None
 
 
-def _alone(decoder: Decoder, stretch: Stretch) -> Columns:
-    return decoder.decode(stretch.data, stretch.begin, stretch.length)
-
-
-def _read_log(file: BinaryIO) -> _Log:
-    log = _Log(Walker(file))
+def _read_log(file: BinaryIO, meaning: MeaningOf) -> _Log:
+    log = _Log(Walker(file), meaning)
     for part in log.walker.parts():
         log.take(part)
     if log.foreign:
@@ -232,9 +210,9 @@ def _recording(log: _Log) -> Recording:
     motions, masters, joints, tools, setpoints = [], [], [], [], []
     signals: dict[TopicKind, dict[str, Signal]] = {kind: {} for kind in TopicKind}
     for topic in sorted(log.topics.values(), key=lambda topic: topic.name):
-        if not topic.parts:
+        if not topic.columns:
             continue
-        kind, whose = topic.meaning.kind, topic.meaning.whose
+        kind, owner = topic.meaning.kind, topic.meaning.owner
         try:
             if kind is TopicKind.MOTION:
                 motions.append(_motion(topic))
@@ -245,9 +223,9 @@ def _recording(log: _Log) -> Recording:
             elif kind is TopicKind.JOINTS:
                 joints.append(_joints(topic))
             elif kind is TopicKind.TOOL:
-                tools.append((whose, _tool(topic)))
+                tools.append((owner, _tool(topic)))
             else:
-                signals[kind][whose] = _signal(topic)
+                signals[kind][owner] = _signal(topic)
         except SkillsError as error:
             log.leave_out(topic, error)
     pedals = signals[TopicKind.PEDAL]
@@ -287,7 +265,7 @@ def _motion(topic: _Topic) -> Motion:
     with np.errstate(over="ignore"):  # infinite values are refused below
         tip_mm = 1000.0 * poses[:, :3]  # ROS messages are in metres
     return recorded_motion(
-        arm=topic.meaning.whose,
+        arm=topic.meaning.owner,
         topic=topic.name,
         frame=_one_frame(topic),
         stamps_ns=stamps_ns,
@@ -310,12 +288,12 @@ def _one_frame(topic: _Topic) -> str:
 
 def _joints(topic: _Topic) -> Joints:
     stamps_ns, positions = _in_order(topic)
-    if topic.meaning.whose.upper().startswith("PSM"):
-        if positions.shape[1] <= _INSERTION:
+    if topic.meaning.owner.upper().startswith("PSM"):
+        if positions.shape[1] <= INSERTION:
             raise NoUsableTopic(f"{topic.name} has {positions.shape[1]} joints; a PSM has 6.", topic=topic.name)
         with np.errstate(over="ignore"):  # infinite values are refused below
-            positions[:, _INSERTION] *= 1000.0  # ROS messages are in metres
-    return recorded_joints(topic.meaning.whose, topic.name, stamps_ns, positions)
+            positions[:, INSERTION] *= 1000.0  # ROS messages are in metres
+    return recorded_joints(topic.meaning.owner, topic.name, stamps_ns, positions)
 
 
 def _signal(topic: _Topic) -> Signal:

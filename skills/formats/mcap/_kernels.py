@@ -17,7 +17,7 @@ from skills.compiled import compiled, inner
 ONE, TWO, THREE, FOUR, FIVE, SIX, SEVEN, EIGHT = (np.uint64(n) for n in range(1, 9))
 BY_1, BY_2, BY_3, BY_4, BY_5, BY_6, BY_7 = (np.uint64(8 * n) for n in range(1, 8))
 MESSAGE, HEAD, TIMES, LEAST = (np.uint64(n) for n in (5, 9, 22, 31))  # an opcode, and bytes
-LENGTH_AT, CHANNEL_AT, LOG_AT = (np.uint64(n) for n in (1, 9, 15))
+LENGTH_AT, CHANNEL_AT = (np.uint64(n) for n in (1, 9))
 
 
 @inner
@@ -42,7 +42,6 @@ def follow(
     messages: Any,  # (N,) int64, output: the byte at which each message begins
     lengths: Any,  # (N,) int64, output: of its content, without the header
     channels: Any,  # (N,) uint16, output
-    log_ns: Any,  # (N,) uint64, output
 ) -> Any:
     """Find messages up to the first record that is not a message, is incomplete, or does not fit into the arrays.
 
@@ -59,7 +58,6 @@ def follow(
         messages[count] = at
         lengths[count] = length - TIMES
         channels[count] = np.uint64(data[at + CHANNEL_AT]) | np.uint64(data[at + CHANNEL_AT + ONE]) << BY_1
-        log_ns[count] = word(data, at + LOG_AT)
         at += HEAD + length
         count += 1
     return count, at
@@ -69,44 +67,31 @@ def take(
     data: Any,  # (B,) uint8
     messages: Any,  # (N,) int64: the byte at which each message begins
     lengths: Any,  # (N,) int64: of its content
-    kinds: Any,  # (N,) int64: the shape, of S, to test each message for; -1 for none
-    sizes: Any,  # (S,) int64: the length of the content in each shape
-    words: Any,  # (S + 1,) uint64: shape k reads the words from words[k] to words[k + 1]
-    gets: Any,  # (S,) uint64: the first of them to copy; those before are only compared
-    places: Any,  # (W,) uint64: offset of each word in a message, in bytes
-    masks: Any,  # (W,) uint64: its bits that identify the shape
-    marked: Any,  # (W,) uint64: the values of these bits
-    reach: Any,  # (S,) uint64, initially 0, output: the number of bytes of a message that contain all its words
-    rooms: Any,  # (S + 1,) uint64: the slice of `taken` for each shape, as above
-    taken: Any,  # (T,) uint64, output: the words, for each shape one message after the other
-    found: Any,  # (S,) uint64, initially 0, output: the number of messages of each shape
-    fits: Any,  # (N,) bool, output: whether each message has its shape
-) -> None:
-    """Copy words from every message that has the length and the marked bits of its shape."""
-    end = np.uint64(len(data))
-    for kind in range(len(sizes)):
-        for k in range(words[kind], words[kind + 1]):
-            reach[kind] = max(reach[kind], places[k] + EIGHT)
+    size: int,  # the length of the content in this shape
+    looks: int,  # the number of words, the first ones, that are only compared
+    places: Any,  # (M,) uint64: offset of each word in a message, in bytes
+    masks: Any,  # (M,) uint64: its bits that identify the shape
+    marked: Any,  # (M,) uint64: the values of these bits
+    taken: Any,  # (N, M - looks) uint64, output: the other words of each message that has the shape
+    fits: Any,  # (N,) bool, output: whether each message has the shape
+) -> Any:
+    """Copy words from every message that has the length and the marked bits of a shape; return how many have."""
+    end, reach, found = np.uint64(len(data)), np.uint64(0), 0
+    for k in range(len(places)):
+        reach = max(reach, places[k] + EIGHT)
     for n in range(len(messages)):
-        fits[n] = False
-        if kinds[n] < 0 or kinds[n] >= len(sizes) or lengths[n] != sizes[kinds[n]]:
-            continue
-        own, first = np.uint64(kinds[n]), np.uint64(messages[n])
-        get, stop = gets[own], words[own + ONE]
-        to = rooms[own] + found[own] * (stop - get)
-        if first > end or end - first < reach[own] or to + (stop - get) > rooms[own + ONE]:
-            continue
-        same = True
-        for k in range(words[own], get):
-            if word(data, first + places[k]) & masks[k] != marked[k]:
-                same = False
-                break
+        first = np.uint64(messages[n])
+        same = lengths[n] == size and first <= end and end - first >= reach
+        k = 0
+        while same and k < looks:
+            same = word(data, first + places[k]) & masks[k] == marked[k]
+            k += 1
+        fits[n] = same
         if same:
-            for k in range(get, stop):
-                taken[to] = word(data, first + places[k])
-                to += ONE
-            found[own] += ONE
-            fits[n] = True
+            for k in range(looks, len(places)):
+                taken[found, k - looks] = word(data, first + places[k])
+            found += 1
+    return found
 
 
 follow_compiled = compiled(follow)

@@ -11,43 +11,23 @@ counted from the end of that header; a string or a sequence is preceded by its l
 same positions: they have one shape. A shape is determined once, in Python; a compiled loop then copies the numbers from
 all messages.
 
-All messages of a topic are decoded at once:
+All messages of a channel in some MiB of the file are decoded at once:
 
     definition --fields_of--> fields --Decoder--> Columns: log times and stamps (N,), values (N, K), labels
-
-The shape of the messages of one channel hardly ever changes. So all channels are decoded together, in one pass over the
-file's bytes; a channel whose shape does change is decoded separately.
 """
 
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from operator import mul
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skills.arrays import Floats, Ints
+from skills.arrays import Flags, Floats, Ints
 from skills.errors import UnreadableRecording
 from skills.formats.mcap import _kernels
-from skills.formats.mcap.records import HEAD, MESSAGE, Bytes, Chain, looked_at
-
-__all__ = [
-    "SHAPES_LIMIT",
-    "SLACK_BYTES",
-    "WANTED_POSE",
-    "Columns",
-    "Decoder",
-    "Field",
-    "Taken",
-    "Wanted",
-    "decode_together",
-    "fields_of",
-    "joined",
-]
+from skills.formats.mcap.records import HEAD, MESSAGE, Bytes, looked_at
 
 FIELDS_LIMIT = 1000
 DEPTH_LIMIT = 20
@@ -245,14 +225,6 @@ class Shape:
         return Columns(taken[:, 0], stamps_ns, values, (self.text,), np.zeros(len(taken), dtype=np.int64))
 
 
-@dataclass(frozen=True, eq=False)
-class Taken:
-    """Copied words of messages of one shape, shape (N, W)."""
-
-    shape: Shape
-    words: NDArray[np.uint64]
-
-
 @dataclass(frozen=True)
 class _Run:
     """Adjacent numbers: numpy's type code, their count, and the index of the first of their words."""
@@ -267,46 +239,23 @@ class _Run:
         return taken[:, self.word : self.word + words].view(self.code)[:, : self.count]
 
 
-def take(
-    data: Bytes, messages: Ints, lengths: Ints, kinds: Ints, shapes: Sequence[Shape], counts: Sequence[int]
-) -> tuple[NDArray[np.bool_], list[NDArray[np.uint64]]]:
-    """Copy the wanted words from messages, in one pass over all of them.
+def take(data: Bytes, messages: Ints, lengths: Ints, shape: Shape) -> tuple[Flags, NDArray[np.uint64]]:
+    """Copy the wanted words from the messages of a shape.
 
     Args:
         data: Bytes with the messages, shape (B,); `SLACK_BYTES` more follow the last message.
         messages: Position of each header, shape (N,).
         lengths: Length of each content, shape (N,).
-        kinds: Index of the shape to test each message for, -1 for none, shape (N,).
-        shapes: S shapes.
-        counts: The number of messages that may have each shape.
+        shape: The shape.
 
     Returns:
-        Which messages have their shape, shape (N,), and for every shape the words of its messages, shape (K, W).
+        Which messages have the shape, shape (N,), and the words of these, shape (K, W).
     """
-    widths = [len(shape.places) - shape.looks for shape in shapes]
-    rooms = np.cumsum([0, *map(mul, widths, counts)], dtype=np.uint64)
-    words = np.cumsum([0, *(len(shape.places) for shape in shapes)], dtype=np.uint64)
-    taken, found = np.empty(rooms[-1], np.uint64), np.zeros(len(shapes), np.uint64)
+    taken = np.empty((len(messages), len(shape.places) - shape.looks), np.uint64)
     fits = np.empty(len(messages), np.bool_)
-    _kernels.take_compiled(
-        looked_at(data),
-        messages,
-        lengths,
-        kinds,
-        np.array([shape.size for shape in shapes]),
-        words,
-        words[1:] - np.array(widths, np.uint64),
-        np.concatenate([shape.places for shape in shapes]),
-        np.concatenate([shape.masks for shape in shapes]),
-        np.concatenate([shape.marked for shape in shapes]),
-        np.zeros(len(shapes), np.uint64),
-        rooms,
-        taken,
-        found,
-        fits,
-    )
-    each = zip(rooms.tolist(), found.tolist(), widths, strict=False)
-    return fits, [taken[begin : begin + count * width].reshape(count, width) for begin, count, width in each]
+    of_shape = (shape.size, shape.looks, shape.places, shape.masks, shape.marked)
+    found = _kernels.take_compiled(looked_at(data), messages, lengths, *of_shape, taken, fits)
+    return fits, taken[: int(found)]
 
 
 def shape_of(message: bytes, fields: Sequence[Field], wanted: Wanted, topic: str) -> Shape:
@@ -502,29 +451,10 @@ class Decoder:
             while len(left):
                 first = int(begin[left[0]])
                 shape = known.pop(0) if known else self._shape(data[first : first + size].tobytes())
-                kinds = np.zeros(len(left), np.int64)
-                fits, (taken,) = take(data, begin[left] - HEAD_BYTES, length[left], kinds, [shape], [len(left)])
+                fits, taken = take(data, begin[left] - HEAD_BYTES, length[left], shape)
                 if len(taken):
                     yield left[fits], shape.columns(taken)
                 left = left[~fits]
-
-    def expected(self, data: Bytes, chain: Chain, number: int) -> Shape | None:
-        """Return the most likely shape of the channel's messages: the last one cached, or that of its first message.
-
-        Args:
-            data: Bytes with the messages, shape (B,).
-            chain: Their positions.
-            number: The channel's number; it has messages in the chain.
-
-        Returns:
-            None where the first message is invalid.
-        """
-        if not self._shapes:
-            which = int(np.argmax(chain.channels == number))
-            begin = int(chain.messages[which]) + HEAD_BYTES
-            with suppress(UnreadableRecording):  # raised again when the channel is decoded separately
-                self._shape(data[begin : begin + int(chain.lengths[which])].tobytes())
-        return self._shapes[-1] if self._shapes else None
 
     def _shape(self, message: bytes) -> Shape:
         """Determine the shape of a message, and cache it."""
@@ -537,45 +467,3 @@ class Decoder:
         shape = shape_of(message, self._fields, self._wanted, self._topic)
         self._shapes.append(shape)
         return shape
-
-
-def decode_together(decoders: Mapping[int, Decoder], data: Bytes, chain: Chain) -> dict[int, Taken]:
-    """Copy the wanted words of all channels whose messages all have the expected shape.
-
-    Args:
-        decoders: By channel number; each channel has messages here.
-        data: Bytes with the messages, shape (B,); `SLACK_BYTES` more follow the last one.
-        chain: Their positions.
-
-    Returns:
-        By channel number; a channel that is missing has to be decoded separately.
-    """
-    kinds = np.full(len(chain.counts), -1)
-    shapes: dict[int, Shape] = {}
-    left = len(data)
-    for number, decoder in decoders.items():
-        shape = decoder.expected(data, chain, number)
-        if shape is not None and (size := int(chain.counts[number]) * shape.size) <= left:
-            kinds[number] = len(shapes)
-            shapes[number] = shape
-            left -= size  # bounds the memory for the words by the size of the data, whatever the counts are
-    if not shapes:
-        return {}
-    counts = chain.counts[list(shapes)].tolist()
-    _, taken = take(data, chain.messages, chain.lengths, kinds[chain.channels], list(shapes.values()), counts)
-    each = zip(shapes.items(), taken, counts, strict=True)
-    return {number: Taken(shape, words) for (number, shape), words, count in each if len(words) == count}
-
-
-def joined(parts: Sequence[Columns | Taken]) -> list[Columns]:
-    """Convert copied words to columns, in the same order.
-
-    Consecutive parts of one shape become one `Columns`, so that there are few arrays.
-    """
-    columns: list[Columns] = []
-    for shape, some in groupby(parts, key=lambda part: part.shape if isinstance(part, Taken) else None):
-        if shape is None:
-            columns += [part for part in some if isinstance(part, Columns)]
-        else:
-            columns.append(shape.columns(np.concatenate([part.words for part in some if isinstance(part, Taken)])))
-    return columns

@@ -19,7 +19,6 @@ from typing import BinaryIO, Final
 import numpy as np
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from skills.arrays import Ints
 from skills.demonstration.recording import Integrity
@@ -36,11 +35,8 @@ from skills.formats.mcap.records import (
     Chain,
     Fields,
     check_records,
-    follow,
     unpack,
 )
-
-__all__ = ["MAGIC", "NOTES", "Channel", "MessageSchema", "Part", "Stretch", "Walker"]
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -91,14 +87,12 @@ class Stretch:
     Attributes:
         channel: Their channel.
         data: Decompressed bytes of the file, shape (B,), followed by 8 bytes that are not from the file.
-        log_ns: Log times, unsigned nanoseconds, shape (N,).
         begin: Position of each content in `data`, shape (N,); a message's header of 31 bytes precedes it.
         length: Length of each content in bytes, shape (N,).
     """
 
     channel: Channel
     data: Bytes
-    log_ns: NDArray[np.uint64]
     begin: Ints
     length: Ints
 
@@ -127,7 +121,7 @@ class Part:
         """Return the messages of a channel that has some here."""
         which = self.chain.of(channel.number)
         contents = self.chain.messages[which] + (HEAD.size + MESSAGE.size)
-        return Stretch(channel, self.data, self.chain.log_ns[which], contents, self.chain.lengths[which])
+        return Stretch(channel, self.data, contents, self.chain.lengths[which])
 
 
 class Walker:
@@ -244,10 +238,12 @@ class Walker:
         _, length = HEAD.unpack_from(self._source.peek(HEAD.size))
         if length > CHUNK_LIMIT_BYTES:
             raise UnreadableRecording(f"A message or definition of {length} bytes is over the limit. {RECOVER}")
-        end = follow(np.frombuffer(self._source.peek(HEAD.size + length), np.uint8)).end
-        if end == 0:
+        data = np.frombuffer(self._source.peek(HEAD.size + length), np.uint8)
+        chain = Chain(data)
+        chain.follow(len(data))
+        if chain.end == 0:
             raise UnreadableRecording(f"A message is too short for its time stamps. {RECOVER}")
-        return bytes(self._source.take(end))
+        return bytes(self._source.take(chain.end))
 
     def _chunk(self, length: int) -> tuple[bytes, bool]:
         self._count()

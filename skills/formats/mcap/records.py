@@ -5,7 +5,7 @@ arrays and maps are preceded by their length.
 
 Chunks are decompressed to no more than their claimed size.
 
-    bytes --Chain.follow--> for each message its position, length, channel and log time
+    bytes --Chain.follow--> for each message its position, length and channel
 
 The end of a record is known only from its header, so records are followed one by one from the first byte: messages by a
 compiled loop, all other records in Python.
@@ -215,7 +215,7 @@ class Chain:
         self._count = 0
         most = len(data) // (HEAD.size + MESSAGE.size)
         self._messages, self._lengths = np.empty(most, np.int64), np.empty(most, np.int64)
-        self._channels, self._log_ns = np.empty(most, np.uint16), np.empty(most, np.uint64)
+        self._channels = np.empty(most, np.uint16)
 
     def follow(self, to: int) -> None:
         """Find further records up to a byte.
@@ -229,7 +229,7 @@ class Chain:
             UnreadableRecording: More other records than any recorder writes.
         """
         data = self._data[:to]
-        view, found = data.data, (self._messages, self._lengths, self._channels, self._log_ns)
+        view, found = data.data, (self._messages, self._lengths, self._channels)
         while True:
             self._count, self.end = map(int, _kernels.follow_compiled(data, self.end, self._count, *found))
             before = len(self.others)
@@ -255,11 +255,6 @@ class Chain:
         """The channel number of each message, shape (N,)."""
         return self._channels[: self._count]
 
-    @property
-    def log_ns(self) -> NDArray[np.uint64]:
-        """The log time of each message, unsigned nanoseconds, shape (N,)."""
-        return self._log_ns[: self._count]
-
     @cached_property
     def counts(self) -> Ints:
         """The number of messages by channel number; cached, so read it only after the last `follow`."""
@@ -277,22 +272,6 @@ class Chain:
     @cached_property
     def _ends(self) -> Ints:
         return np.cumsum(self.counts)
-
-
-def follow(data: Bytes) -> Chain:
-    """Find consecutive records from the beginning of the data.
-
-    It stops at the first record that is incomplete or is not a message, a definition or a private record.
-
-    Args:
-        data: Starts with a record's header, shape (B,).
-
-    Raises:
-        UnreadableRecording: More other records than any recorder writes.
-    """
-    chain = Chain(data)
-    chain.follow(len(data))
-    return chain
 
 
 def looked_at(data: Bytes) -> Bytes:

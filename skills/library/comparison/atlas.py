@@ -58,16 +58,7 @@ from skills.library.people.catalogue import find_suture_type
 from skills.library.people.consent import require
 from skills.library.policies.releases import shares_served
 from skills.library.recordings.demos import find_demo
-from skills.schemas.comparison import (
-    Apartness,
-    Atlas,
-    Cluster,
-    Consistency,
-    LeftOutOfAtlas,
-    Merge,
-    OfSurgeon,
-    Place,
-)
+from skills.schemas.comparison import Apartness, Atlas, Cluster, Consistency, LeftOutOfAtlas, Merge, OfSurgeon, Place
 
 DEMOS_AT_ONCE = 100  # recorded motions in memory; each has some thousand samples
 PAIRS_AT_ONCE = 20_000  # measured between two transactions: about a second

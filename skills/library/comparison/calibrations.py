@@ -40,7 +40,7 @@ from skills.scoring.calibration import (
 )
 from skills.scoring.features import TRIAL_NAMES as FIGURES
 from skills.scoring.features import TrialFigures, measure_trial
-from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, refusals, validate
+from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, parse_task, refusals, validate
 
 NAMED = 5  # the most trials that an error names
 LIBRARIES = ("scipy", "numpy")  # the libraries that compute the numbers
@@ -115,7 +115,7 @@ def calibrate_on(
     rated: Rated, *, seed: int = 0, permutations: int = PERMUTATIONS, told: Callable[[float], None] = NOTHING
 ) -> dict[str, Any]:
     """Fit a model, validate it on surgeons left out, and return both with their provenance as JSON."""
-    found, judged = validate(rated.cohort, seed=seed, permutations=permutations, told=told)
+    found, judged = validate(rated.cohort, seed=seed, permutations=permutations, progress=told)
     settings = {"strengths": list(STRENGTHS), "seed": seed, "permutations": permutations, "bootstraps": BOOTSTRAPS}
     return {
         "version": VERSION,
@@ -129,7 +129,7 @@ def calibrate_on(
 
 def accepted(about: dict[str, Any]) -> list[str]:
     """Return the tasks that a calibration rates."""
-    return [name for name, judged in about["validated"]["tasks"].items() if not refusals(judged)]
+    return [name for name, judged in about["validated"]["tasks"].items() if not refusals(parse_task(judged))]
 
 
 def keep(session: Session, about: dict[str, Any], actor: str) -> tuple[StoredCalibration, bool]:
@@ -140,7 +140,7 @@ def keep(session: Session, about: dict[str, Any], actor: str) -> tuple[StoredCal
     """
     if not accepted(about):
         of_tasks = about["validated"]["tasks"]
-        why = " ".join(f"{name}: {' '.join(refusals(judged))}" for name, judged in of_tasks.items())
+        why = " ".join(f"{name}: {' '.join(refusals(parse_task(judged)))}" for name, judged in of_tasks.items())
         raise BadInput(
             f"The model is not accepted, and nothing was stored. {why} These figures are for surgeons left out of the "
             "fit. Calibrate on rated trials of more surgeons, in one set-up.",

@@ -18,6 +18,7 @@ from math import log
 import numpy as np
 from sqlalchemy import select
 
+from skills.arithmetic import wilson
 from skills.arrays import Floats, Ints
 from skills.comparison.distances import shape_of
 from skills.comparison.recognition import NUMBERS, Validated, recognise, signature_of, usable, validate, vote
@@ -26,7 +27,6 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.segments import movements_by_arm
 from skills.errors import BadInput, BadPath, BadRecording, Conflict, NotFound
-from skills.learning.slip import wilson
 from skills.library.comparison.members import Member, members_of, numbered, sessions_of
 from skills.library.people.catalogue import find_suture_type
 from skills.library.people.recorded import in_recording

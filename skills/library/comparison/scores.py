@@ -35,21 +35,21 @@ from skills.library.people.recorded import in_recording
 from skills.library.policies import releases
 from skills.library.recordings.demos import find_demo, newest_demo
 from skills.library.recordings.recordings import Teller, find_recording, stored_recording
-from skills.schemas.comparison import (
+from skills.schemas.scores import (
     CurvePoint,
     Percentiles,
     Progress,
     Reference,
     Score,
     ScoredStyle,
+    ScoreIn,
     SessionFigures,
 )
-from skills.schemas.requests import ScoreIn
 from skills.scoring.calibration import LEVELS, Level
 from skills.scoring.deviation import as_recorded, differences, laid, laid_on
 from skills.scoring.features import KINDS, Numbers, compare, measure, measure_trial
 from skills.scoring.rating import Skill, rate, unrated
-from skills.scoring.validation import refusals
+from skills.scoring.validation import parse_task, refusals
 
 LEAST_DEMOS, LEAST_SURGEONS = 5, 2  # of a level: with fewer, a percentile is meaningless, or describes one person
 MOST_OTHERS = 1000  # the newest of a suture type; more would not change a percentile visibly
@@ -459,7 +459,7 @@ def _skill(database: Database, recording: StoredRecording, task: str | None, tel
     if named not in model.tasks:
         why = "the calibration has several tasks" if named is None else f"the calibration has no task {named}"
         return unrated(f"Not rated: {why}. Name the recording's task; it has {', '.join(model.tasks)}.")
-    judged = stored.about["validated"]["tasks"][named]
+    judged = parse_task(stored.about["validated"]["tasks"][named])
     if refused := refusals(judged):
         return unrated(
             f"Not rated: the calibration is not accepted for {named}. {' '.join(refused)} The operator of this "

@@ -42,7 +42,8 @@ from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import DatasetChunk, ErasedSurgeon, Job, StoredDataset
 from skills.db.session import Database
 from skills.errors import Busy, Corrupt, NotFound, SkillsError
-from skills.formats.reader_process import READER_VERSION, read_told
+from skills.formats.parsed import parse_recording
+from skills.formats.reader_process import READER_VERSION
 from skills.gridworld.reward import sparse_reward
 from skills.library.comparison.calibrations import read_calibration
 from skills.library.operation.history import Verified, verify_history
@@ -76,7 +77,7 @@ class Checked:
 
 def inspect_installation(
     database: Database,
-    tell: Teller = read_told,
+    tell: Teller = parse_recording,
     *,
     decode_all: bool = False,
     heads: Sequence[Note] | None = None,

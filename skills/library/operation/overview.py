@@ -37,8 +37,9 @@ from skills.db.models import (
 )
 from skills.db.service_tables import Event, Executor, Job
 from skills.db.session import Database
-from skills.demonstration.demonstration import Demo, Recording
+from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import press_times, smoothed_speed
+from skills.demonstration.recording import Recording
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.policy import Policy

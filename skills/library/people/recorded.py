@@ -18,7 +18,7 @@ from skills.db.models import Demonstration, ErasedInterval, RecordingSurgeon, St
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
 from skills.errors import Conflict
-from skills.formats.reader_process import Told
+from skills.formats.parsed import ParsedContent
 from skills.library.people import consent
 from skills.library.recordings.recordings import Teller, find_recording, stored_recording
 
@@ -88,7 +88,7 @@ def recording_for(session: Session, recording_sha256: str, use: consent.Use) -> 
     return recording
 
 
-def shown_recording(database: Database, recording_sha256: str, tell: Teller) -> Told:
+def shown_recording(database: Database, recording_sha256: str, tell: Teller) -> ParsedContent:
     """Return what is read of a stored recording, to be shown; everybody in it is asked after it was read.
 
     It raises the errors of `recording_for`, and of `skills.library.recordings.recordings.stored_recording`.

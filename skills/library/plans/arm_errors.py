@@ -25,7 +25,8 @@ from skills.errors import BadInput, BadRecording, BadSettings
 from skills.formats import SUFFIXES, media_type_of, read_recording
 from skills.formats.rosbag import Suffix, positions_on
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
-from skills.verification.arm_errors import NAMED, SIZES, ArmErrors, MeasuredArm, checked_own
+from skills.verification.arm_calibration import MeasuredArm
+from skills.verification.arm_errors import NAMED, SIZES, ArmErrors, checked_own
 
 MOST_ROWS = 1_000_000
 LOST_PERIODS = 3.0  # ours: between positions further apart than so many of its periods the tracker had lost the marker

@@ -23,7 +23,7 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import Partner
 from skills.errors import BadPlan, BadSpeed, Conflict, NoApproach, NoHandOff
-from skills.formats.suture_points import PARSE, SuturePoints, suture_points
+from skills.formats.suture_points import READ, SuturePoints, suture_points
 from skills.gridworld.grid import refuse_metres
 from skills.gridworld.scene import Scene, Tissue
 from skills.kinematics import DEFAULT_INSTRUMENT
@@ -39,7 +39,8 @@ from skills.planning.plan import SuturePlan, pose_xyzw, stack, turn_deg
 from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
-from skills.schemas.plans import PlanIn, PsmMIn, Reach, ReachIn
+from skills.schemas.plans import PlanIn, PsmMIn
+from skills.schemas.reach import Reach, ReachIn
 from skills.verification.reach import MAX_PLACES, ReachPlace, map_reach
 
 
@@ -55,7 +56,7 @@ def find_suture_points(upload: Upload, arm: str | None, frame: str | None, read:
     Raises:
         BadRecording: It cannot be used; `skills.errors` lists the kinds.
     """
-    scene = read_upload(upload.read_as({}), partial(read, target=PARSE))
+    scene = read_upload(upload.read_as({}), partial(read, target=READ))
     return suture_points(scene, arm=arm, frame=frame)
 
 
@@ -261,7 +262,7 @@ def _psm_m(asked: PsmMIn, partner: Partner | None) -> PsmM:
 def trajectory_of(plan: SuturePlan) -> Trajectory:
     """Return the trajectory of a plan, sampled at its own rate; the same plan gives the same bytes."""
     return time_parametrise(
-        plan.pass_paths,
+        plan.passes,
         speed_mm_s=plan.speed_mm_s,
         rate_hz=plan.rate_hz,
         instrument=plan.instrument,

@@ -22,12 +22,13 @@ from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt
 from skills.formats.replay_bag import (
     ArmMotion,
+    Timetable,
     arms_of,
     folder_of,
     held_jaw_rad,
+    pass_times,
     rows_of_pass,
     seal,
-    timetable,
 )
 from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VERDICT
 from skills.learning.evaluation import TIE_BREAK, dtw
@@ -169,9 +170,8 @@ def replay_bag(
         pass_index=pass_index,
     )
     members = {name: _written(paper) for name, paper in papers.items()}
-    members[EXECUTOR] = _written(
-        {"use": USE, "plan": row.sha256, "before_each_pass": BY_HAND, "passes": timetable(trajectory, arms)}
-    )
+    timetable = Timetable(plan=row.sha256, use=USE, before_each_pass=BY_HAND, passes=pass_times(trajectory, arms))
+    members[EXECUTOR] = _written(timetable.model_dump())
     head = proofs.head_over(database, rows)
     members[README] = _readme(papers[PLAN], papers[VERDICT]["report"], arms, head).encode()
     for arm in arms:

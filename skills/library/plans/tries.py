@@ -28,7 +28,7 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.segments import Segment
 from skills.errors import BadSettings, Conflict, SkillsError
-from skills.formats.reader_process import Told
+from skills.formats.parsed import ParsedContent
 from skills.gridworld import paper
 from skills.gridworld.grid import PathReport, choose_grid, describe_path, discretize
 from skills.library.operation import jobs, locks
@@ -56,8 +56,9 @@ from skills.library.policies.training import (
 from skills.library.recordings.demos import add_demo, choose_part, find_demo
 from skills.library.recordings.recordings import Teller, confined_reader, find_recording, stored_recording
 from skills.remedies import Remedy
+from skills.schemas.demos import DemoIn
 from skills.schemas.plans import PlanIn, SuturePointIn
-from skills.schemas.requests import DemoIn, TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.schemas.tries import Choice, StepName, TryIn, TryStep
 from skills.settings import Settings
 from skills.verification.gates import SCENE
@@ -101,7 +102,7 @@ def perform_try(database: Database, request: dict[str, Any], settings: Settings)
     told: list[dict[str, Any]] = []
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if the recording is not cached
-        for step in try_recording(database, asked, actor, settings, reader.tell):
+        for step in try_recording(database, asked, actor, settings, reader.parse):
             told.append(step.model_dump(mode="json"))
             with database.writing(()) as session:
                 so_far = {"result": {"steps": told}, "progress": min(len(told) / STEPS, 0.95)}
@@ -270,7 +271,7 @@ def _refused(name: StepName, refused: SkillsError, others: Sequence[Choice]) -> 
     return TryStep(name=name, state="refused", text=refused.message, choices=tuple(others), remedies=remedies)
 
 
-def _read_in_words(told: Told) -> str:
+def _read_in_words(told: ParsedContent) -> str:
     about = told.about
     motions = "; ".join(
         f"{one['arm']} in {one['frame']}, {one['samples']} samples at {quality['rate_hz']:.0f} Hz"

@@ -49,7 +49,7 @@ from skills.library.policies.training import (
 from skills.library.policies.versions import LearntIn, Recipe, kept_of, learner_kept, recipes_of, refuse_unlike
 from skills.library.recordings.demos import newest_demos
 from skills.library.recordings.recordings import Teller, confined_reader
-from skills.schemas.policies import FitOnTheSame, PolicyFigures, StoredComparison
+from skills.schemas.training import FitOnTheSame, PolicyFigures, StoredComparison
 from skills.settings import Settings
 
 TOGETHER = 25  # styles
@@ -179,7 +179,7 @@ def retrain_part(database: Database, request: PartRequest, settings: Settings) -
     with database.reading() as session:
         job = session.get_one(Job, request["retraining"])
         shared = cast(RetrainingRequest, job.request)
-        batch = _Batch(job.row, request["part"], shared, job.asked_by, settings, reader.tell)
+        batch = _Batch(job.row, request["part"], shared, job.asked_by, settings, reader.parse)
     with AT_WORK, closing(reader.server):  # it starts only if a recording is not cached
         _train_all(database, batch)
 

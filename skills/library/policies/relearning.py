@@ -21,7 +21,7 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo, partner_motion
 from skills.demonstration.partner import PartnerMotion
 from skills.errors import NotFound
-from skills.formats.reader_process import Told
+from skills.formats.parsed import ParsedContent
 from skills.gridworld.grid import GridPath, discretize
 from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import NearLimits, OddsLimits
@@ -137,9 +137,9 @@ class StoredRecordings:
     def __init__(self, database: Database, tell: Teller) -> None:
         """Read from this database, by a reader that is possibly in another process."""
         self._database, self._tell = database, tell
-        self._last: tuple[int, Told] | None = None
+        self._last: tuple[int, ParsedContent] | None = None
 
-    def read(self, row: int) -> Told:
+    def read(self, row: int) -> ParsedContent:
         """Decode a recording.
 
         Raises:
@@ -151,7 +151,7 @@ class StoredRecordings:
         return self._last[1]
 
 
-def decoded(database: Database, row: int, tell: Teller) -> Told:
+def decoded(database: Database, row: int, tell: Teller) -> ParsedContent:
     """Decode the stored bytes of a recording, whatever is cached of it.
 
     Raises:

@@ -69,7 +69,7 @@ from skills.library.operation.integrity import learnt
 from skills.library.people import consent
 from skills.library.people.consent import refusal
 from skills.planning.plan import CONSTANT_TURN_DEG, DrivenPass, departure_of, driven_pass
-from skills.schemas.policies import FitOnTheSame
+from skills.schemas.training import FitOnTheSame
 
 ROUNDING_MM = 1e-6  # two sums of the same distances in different order differ by less
 

@@ -29,7 +29,7 @@ from skills.library.policies.versions import Kept, Recipe, in_pieces, kept_of, l
 from skills.library.recordings.demos import newest_demos
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
-from skills.schemas.requests import RetrainingIn
+from skills.schemas.training import RetrainingIn
 
 MOST_IN_A_PART = 50  # styles: the engine's overhead for a part, some 30 ms, is then spread over a second of work
 STYLES_AT_ONCE = 500  # rows that one transaction adds: others wait for it, on SQLite all writers

@@ -39,8 +39,8 @@ from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Conflict, NotFound, SkillsError
 from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
+from skills.gridworld.hazards import Surroundings, hazards_of, refuse_unfit
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
-from skills.gridworld.scene import Surroundings, hazards_of, refuse_unfit
 from skills.learning.certificate import (
     Certificate,
     NearLimits,
@@ -51,7 +51,6 @@ from skills.learning.certificate import (
     near_odds,
     near_starts,
 )
-from skills.learning.dynamic_programming import rule_in
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.in_scene import SceneCertificate, certify_in_scene, learn_in_scene, scene_learner
 from skills.learning.policy import (
@@ -65,6 +64,7 @@ from skills.learning.policy import (
     refuse_too_large,
 )
 from skills.learning.q_learning import PhaseQLearning
+from skills.learning.ties import rule_in
 from skills.learning.tube import certified_poses
 from skills.library.operation import jobs
 from skills.library.operation.integrity import policy_identity_of, poses_identity_of, scene_digest
@@ -80,7 +80,7 @@ from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass
 from skills.remedies import Action, Remedy
 from skills.schemas.policies import JOINING_FORMAT, Coverage, GridCertificate, Joining
-from skills.schemas.requests import TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 
 # Statements executed for every style, built once: building one takes as long as executing it.
@@ -310,7 +310,7 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
         found = lessons(session, [find_demo(session, one).row for one in request["demos"]])
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if a recording is not cached
-        found = with_partners(database, found, reader.tell)
+        found = with_partners(database, found, reader.parse)
     lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
     learnt = learn_style(lesson, request, settings, jobs.telling(database, "training", request))
 

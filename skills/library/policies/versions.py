@@ -41,7 +41,8 @@ from skills.library.policies.releases import is_served
 from skills.library.recordings.demos import find_demo, newest_demos
 from skills.remedies import Action, Remedy
 from skills.schemas import policies as described
-from skills.schemas.policies import NextPose, Rollout
+from skills.schemas.policies import Rollout
+from skills.schemas.pose_styles import NextPose
 
 MAX_JSON_ACTIONS = 10**6  # ours: above it, JSON has the certified domain alone, in `live_actions`
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second

@@ -66,7 +66,7 @@ from skills.library.recordings.demos import find_demo
 from skills.library.recordings.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
-from skills.schemas.requests import DatasetIn
+from skills.schemas.datasets import DatasetIn
 from skills.settings import Settings
 
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once
@@ -315,8 +315,8 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         read = confined_reader(settings)
         with closing(read.server):  # it starts at the first recording that is not cached
             # Read once more than written: whether all episodes have setpoints is known after the last one.
-            rule = action_rule(_exported(database, read.tell, episodes, lambda _: tell(0.0)), about)
-            exported = _exported(database, read.tell, episodes, tell)
+            rule = action_rule(_exported(database, read.parse, episodes, lambda _: tell(0.0)), about)
+            exported = _exported(database, read.parse, episodes, tell)
             about = replace(about, action=rule)
             made = write_dataset(file, exported, about, cast(Version, request["version"]), settings)
         until_stored = opened.pop_all()

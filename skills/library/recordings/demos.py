@@ -24,13 +24,13 @@ from skills.db.models import (
 from skills.db.packed import digest
 from skills.db.service_tables import record_event
 from skills.db.session import Database
-from skills.demonstration.demonstration import Demo, Segment, cut_demo
+from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.quality import describe
 from skills.demonstration.recording import equal_samples
-from skills.demonstration.segments import TakenSegment
+from skills.demonstration.segments import Segment, TakenSegment
 from skills.errors import BadSegment, Conflict, SegmentNotNamed
 from skills.fields import as_json
-from skills.formats.reader_process import MOST, Told, read_told
+from skills.formats.parsed import MOST, ParsedContent, parse_recording
 from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, describe_path, discretize
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.library.operation import locks
@@ -53,8 +53,7 @@ from skills.library.recordings.recordings import (
 from skills.packing import canonical
 from skills.remedies import Action, Remedy
 from skills.schemas import ChosenGrid, DemoOutcome, OutcomeAsked
-from skills.schemas.recordings import DemoReport
-from skills.schemas.requests import DemoIn
+from skills.schemas.demos import DemoIn, DemoReport
 
 EQUAL_SHARE = 0.1  # ours: an arm that rests on exact encoder values for a tenth of the time is no reason for advice
 # The actions of the events that mark an outcome.
@@ -84,7 +83,7 @@ class Added(NamedTuple):
     taken: TakenSegment
 
 
-def make_demo(told: Told, cut: DemoIn) -> Made:
+def make_demo(told: ParsedContent, cut: DemoIn) -> Made:
     """Cut a hand-off out of a recording and put it into its grid world.
 
     Raises:
@@ -102,7 +101,7 @@ def make_demo(told: Told, cut: DemoIn) -> Made:
     return Made(demo, path, sparse_reward(path), report, taken)
 
 
-def choose_part(told: Told, cut: DemoIn) -> tuple[DemoIn, str, str]:
+def choose_part(told: ParsedContent, cut: DemoIn) -> tuple[DemoIn, str, str]:
     """Return the request with the times of the part to cut, the name of that part, and the reason for the choice.
 
     Raises:
@@ -128,7 +127,7 @@ def choose_part(told: Told, cut: DemoIn) -> tuple[DemoIn, str, str]:
     return _proposal(cut, proposed, 1)
 
 
-def _proposed(told: Told, cut: DemoIn) -> list[Segment]:
+def _proposed(told: ParsedContent, cut: DemoIn) -> list[Segment]:
     """Return the proposals that match the request's arm and topic, in the order in which the recording lists them."""
     fitting = {m.arm for m in told.recording.motions if cut.arm in (None, m.arm) and cut.topic in (None, m.topic)}
     return [one for one in told.proposed if one.arm in fitting]
@@ -214,7 +213,7 @@ def _about_equal(count: int, samples: int) -> list[str]:
     ]
 
 
-def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:
+def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, read: Teller = parse_recording) -> Added:
     """Store a recording and one demonstration of it, both or neither.
 
     Args:
@@ -240,7 +239,9 @@ def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, rea
     return added
 
 
-def add_demo(database: Database, recording_sha256: str, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:
+def add_demo(
+    database: Database, recording_sha256: str, cut: DemoIn, actor: str, read: Teller = parse_recording
+) -> Added:
     """Cut another demonstration out of a stored recording; it raises the errors of `make_demo` as well."""
     with database.reading() as session:
         find_surgeon(session, cut.surgeon)

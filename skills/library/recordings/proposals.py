@@ -24,7 +24,7 @@ from skills.db.models import Demonstration, ErasedInterval, ProposalMark, Record
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
-from skills.formats.reader_process import MOST
+from skills.formats.parsed import MOST
 from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import shown_recording
 from skills.library.recordings.recordings import Teller, find_recording

@@ -1,7 +1,7 @@
 """Recordings: raw files, read and checked before any transaction, stored in chunks of 1 MiB; and their content, cached.
 
-    file --Upload--> read_upload, tell_upload --keep--> StoredRecording with its chunks --stored_recording--> Told
-    Told --entry_of--> Entry --put_entry--> rows --cached_content--> Told
+    file --Upload--> read_upload, tell_upload --keep--> StoredRecording, chunks --stored_recording--> ParsedContent
+    ParsedContent --entry_of--> Entry --put_entry--> rows --cached_content--> ParsedContent
 
 Decoding a bag takes up to a second of processor time per MiB, reading the entry of its content takes a millisecond. The
 bytes remain the truth: an entry is used only if `READER_VERSION`, the reading parameters and its SHA-256 agree, and its
@@ -41,11 +41,12 @@ from skills.db.models import (
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
-from skills.demonstration.demonstration import Recording
+from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
-from skills.formats.reader_process import KNOWN, READER_VERSION, ConfinedReader, Told, read_told
+from skills.formats.parsed import ParsedContent, parse_recording
+from skills.formats.reader_process import KNOWN, READER_VERSION, ConfinedReader
 from skills.library.operation import locks
 from skills.library.operation.integrity import find_by_digest
 from skills.library.people.catalogue import find_surgeon
@@ -53,11 +54,11 @@ from skills.packing import canonical
 from skills.remedies import Action, Remedy
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import refuse_uncontained
-from skills.schemas.requests import Reading
+from skills.schemas.recordings import Reading
 from skills.settings import Settings
 
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
-Teller = Callable[..., Told]  # `read_told`, or a callable that runs it in another process
+Teller = Callable[..., ParsedContent]  # `parse_recording`, or a callable that runs it in another process
 BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
 
 CHUNK_BYTES = 1 << 20
@@ -132,7 +133,7 @@ def read_upload(upload: Upload, read: Reader = read_recording) -> Recording:
     return recording
 
 
-def tell_upload(upload: Upload, tell: Teller = read_told) -> Told:
+def tell_upload(upload: Upload, tell: Teller = parse_recording) -> ParsedContent:
     """Read and check a recording, and derive the proposed hand-offs and its description; it raises as `read_upload`."""
     _check_type(upload)
     told = tell(upload.file, **upload.reading)
@@ -157,7 +158,7 @@ def _check_vouched(upload: Upload, recording: Recording) -> None:
 
 
 def store_recording(
-    database: Database, upload: Upload, actor: str, read: Teller = read_told, surgeon: str | None = None
+    database: Database, upload: Upload, actor: str, read: Teller = parse_recording, surgeon: str | None = None
 ) -> tuple[StoredRecording, bool]:
     """Store a recording once, under a surgeon if one is named; return the row, and whether it is new."""
     if surgeon is not None:
@@ -175,7 +176,7 @@ def store_recording(
     return stored, new
 
 
-def preview(upload: Upload, read: Teller = read_told) -> dict[str, Any]:
+def preview(upload: Upload, read: Teller = parse_recording) -> dict[str, Any]:
     """Return what would be understood of a recording, as JSON; nothing is stored.
 
     A table without times is counted, one second for each sample, and its durations and rates are null.
@@ -208,7 +209,7 @@ def _untimed(about: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def entry_of(upload: Upload, told: Told) -> Entry | None:
+def entry_of(upload: Upload, told: ParsedContent) -> Entry | None:
     """Serialise what was read of an upload for `keep`, before its transaction; None if it is too large to be kept."""
     return packed_content(upload.sha256, upload.size_bytes, upload.reading, told)
 
@@ -279,7 +280,7 @@ def _add_chunks(session: Session, row: int, number: int, data: bytes) -> int:
 
 
 def keep(
-    session: Session, upload: Upload, told: Told, entry: Entry | None, actor: str, ahead: int | None = None
+    session: Session, upload: Upload, told: ParsedContent, entry: Entry | None, actor: str, ahead: int | None = None
 ) -> tuple[StoredRecording, bool]:
     """Write a recording in the caller's transaction, once; return the row, and whether it is new to the actor.
 
@@ -357,8 +358,8 @@ def find_recording(session: Session, recording_sha256: str) -> StoredRecording:
 
 
 def stored_recording(
-    database: Database, recording_sha256: str, tell: Teller = read_told, *, intact: bool = False
-) -> Told:
+    database: Database, recording_sha256: str, tell: Teller = parse_recording, *, intact: bool = False
+) -> ParsedContent:
     """Return what is read of a stored recording: from the cache, or else decoded again, and cached.
 
     No transaction is open while it is decoded.
@@ -388,7 +389,7 @@ def stored_recording(
     return told
 
 
-def _remember(database: Database, stored: StoredRecording, told: Told) -> None:
+def _remember(database: Database, stored: StoredRecording, told: ParsedContent) -> None:
     """Cache what was read of a stored recording, unless the recording was erased meanwhile."""
     entry = packed_content(stored.sha256, stored.size_bytes, stored.reading, told)
     if entry is None:
@@ -525,7 +526,9 @@ def summary_json(row: StoredRecording, demos: int) -> dict[str, Any]:
     }
 
 
-def packed_content(recording_sha256: str, size_bytes: int, reading: dict[str, Any], told: Told) -> Entry | None:
+def packed_content(
+    recording_sha256: str, size_bytes: int, reading: dict[str, Any], told: ParsedContent
+) -> Entry | None:
     """Serialise the content of a recording; None if it takes more bytes than are kept of one.
 
     It is called before the transaction, for which others wait.
@@ -563,7 +566,7 @@ def is_cached(session: Session, stored: StoredRecording) -> bool:
     return row is not None and (row.version, row.reading) == (READER_VERSION, _digest_of(stored.reading))
 
 
-def cached_content(session: Session, stored: StoredRecording) -> Told | None:
+def cached_content(session: Session, stored: StoredRecording) -> ParsedContent | None:
     """Return the content of a recording from its entry; None if there is none that may be used."""
     if not is_cached(session, stored):
         return None
@@ -574,7 +577,7 @@ def cached_content(session: Session, stored: StoredRecording) -> Told | None:
         return None
 
 
-def read_entry(session: Session, stored: StoredRecording) -> Told:
+def read_entry(session: Session, stored: StoredRecording) -> ParsedContent:
     """Return the content of a recording from its entry, of this version.
 
     Raises:
@@ -587,7 +590,7 @@ def read_entry(session: Session, stored: StoredRecording) -> Told:
         raise Corrupt("The entry does not match its digest and is not used; the recording's bytes are decoded instead.")
     try:
         told = packing.read(io.BytesIO(data), KNOWN)
-        if not isinstance(told, Told):
+        if not isinstance(told, ParsedContent):
             raise TypeError(type(told).__name__)
     except Exception as error:  # of any class: its values are refused, or their form is unknown
         raise Corrupt("The entry cannot be read and is not used; the recording's bytes are decoded instead.") from error

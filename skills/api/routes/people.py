@@ -13,9 +13,9 @@ from skills.library.operation.sweep import drop_contents, sweep_erased
 from skills.library.people import catalogue, erasure
 from skills.library.people.catalogue import surgeon_json, suture_json
 from skills.library.people.keys import about_key, create_key, list_keys, revoke_key
-from skills.schemas import SkillLevel
-from skills.schemas.given import Key, NewKey, Page, Surgeon, SutureType
-from skills.schemas.requests import KEY, LINE, KeyIn, SurgeonIn, SutureTypeIn
+from skills.schemas import Page, SkillLevel
+from skills.schemas.people import Key, KeyIn, NewKey, Surgeon, SurgeonIn, SutureType, SutureTypeIn
+from skills.schemas.requests import KEY, LINE
 from skills.settings import MEBIBYTE
 
 router = router_of(route_class=Strict, tags=["catalogue"], max_body_size=MEBIBYTE)

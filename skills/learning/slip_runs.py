@@ -1,39 +1,34 @@
-"""Slip: seeded runs of controllers on a grid whose moves slip, and controllers to compare a policy with.
+"""Seeded runs of controllers on a grid whose moves slip, and controllers to compare a policy with.
 
-    Controller, slips --walk--> Walks --judge--> Outcome
+    Controller, slips --walk--> Walks --judge--> SlipOutcome
 
-*Slip*: with probability `slip`, one of the 27 moves, drawn uniformly, is made instead of the intended one. It may be
-the intended one; off the grid the arm stays. A *controller* returns the next action of each run, a *walk* is the
+The slips are those of `skills.gridworld.slip`. A *controller* returns the next action of each run, a *walk* is the
 sequence of states that results, and an *outcome* summarises walks. `odds` computes the result for a policy exactly,
 without random numbers. The paper has no disturbances; all of this is ours.
 
-`TwoLineRule` needs no learning, only its progress along the demonstration. Two replay controllers take the shortest
-path to the demonstration, planned once from the start, and then replay it. Replay has two fair interpretations: of
-*moves*, one after the other, wherever the arm is; and of *positions by the clock*, as position control does it: at each
-tick the next recorded position is commanded, and the arm moves towards it, at most a cell along each axis. Neither
-takes its progress in the demonstration into account: a replay that did, and waited for each waypoint, would be the
-policy of the phase state, or this rule.
+Two replay controllers take the shortest path to the demonstration, planned once from the start, and then replay it.
+Replay has two fair interpretations: of *moves*, one after the other, wherever the arm is; and of *positions by the
+clock*, as position control does it: at each tick the next recorded position is commanded, and the arm moves towards it,
+at most a cell along each axis. Neither takes its progress in the demonstration into account: a replay that did, and
+waited for each waypoint, would be the policy of the phase state.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import sqrt
 from typing import Protocol
 
 import numpy as np
 
-from skills.arrays import Bytes, Flags, Floats, Ints, frozen
-from skills.errors import BadSettings
+from skills.arrays import Bytes, Flags, Floats, Ints, freeze
 from skills.gridworld.domain import OUTSIDE, Domain
 from skills.gridworld.grid import MOVES, GridPath, GridWorld, discretize
+from skills.gridworld.slip import STEADY, SlipModel
 from skills.learning.evaluation import dtw
 from skills.learning.policy import Policy, Rollout
 
 STOPS = -1  # in place of an action: the run ends here (as with every other number below 0)
-STEADY = -1  # in place of a slip: the intended move is made
 BUDGET = 10  # times the number of the path's states: moves after which a run ends unfinished
 NEGLIGIBLE = 1e-15  # a probability of the size of the rounding error of a sum of 1
-NORMAL_95 = 1.959964  # 95 % of a normal distribution lie within so many standard deviations of its mean
 
 
 class Controller(Protocol):
@@ -67,7 +62,7 @@ class FollowPolicy:
     def decide(self, tick: int, states: Ints, phases: Ints) -> tuple[Ints, Ints]:
         """Update the phases with the states, and look the actions up."""
         domain = self.policy.domain
-        phases, _ = start_all(domain, states) if tick == 0 else enter_all(domain, phases, states)
+        phases, _ = domain.start(states) if tick == 0 else domain.enter(phases, states)
         return self.table[phases, states], phases
 
 
@@ -80,40 +75,8 @@ class StartAnew:
     def decide(self, tick: int, states: Ints, phases: Ints) -> tuple[Ints, Ints]:
         """Choose actions as `FollowPolicy`, but start again in runs that are outside the certified domain."""
         actions, phases = self.follow.decide(tick, states, phases)
-        phases = np.where(actions == OUTSIDE, start_all(self.follow.policy.domain, states)[0], phases)
+        phases = np.where(actions == OUTSIDE, self.follow.policy.domain.start(states)[0], phases)
         return self.follow.table[phases, states], phases
-
-
-def start_all(domain: Domain, states: Ints) -> tuple[Ints, Flags]:
-    """Start in many states at once, as `Domain.start` does in one.
-
-    Args:
-        domain: The domain of the policy.
-        states: States, shape (N,).
-
-    Returns:
-        The phases, and whether each start is already the end, both of shape (N,).
-    """
-    phase, done = domain.start(domain.path.goal)
-    at_goal = states == domain.path.goal
-    return np.where(at_goal, phase, domain.joins[states]), at_goal & done
-
-
-def enter_all(domain: Domain, phases: Ints, states: Ints) -> tuple[Ints, Flags]:
-    """Move onto many states at once, as `Domain.enter` does onto one.
-
-    Args:
-        domain: The domain of the policy.
-        phases: Phases before the moves, shape (N,).
-        states: States moved onto, shape (N,).
-
-    Returns:
-        The phases after the moves, and whether each move finishes, both of shape (N,).
-    """
-    ahead = (phases > 0) & (states == domain.path.states[phases])
-    unjoined = (states == domain.path.goal) & domain.finishes_unjoined
-    finishes = np.where(phases == 0, unjoined, ahead & (phases == domain.phases - 1))
-    return np.where(phases == 0, domain.joins[states], phases + (ahead & ~finishes)), finishes
 
 
 def budget(path: GridPath) -> int:
@@ -126,34 +89,6 @@ def budget(path: GridPath) -> int:
         `BUDGET` times the number of its states.
     """
     return BUDGET * len(path.states)
-
-
-def draw_slips(slip: float, *, runs: int, moves: int, seed: int) -> Bytes:
-    """Draw the slips of all moves of all runs.
-
-    The same arguments give the same bytes. With the same seed, a larger `slip` adds slips to those of a smaller one, so
-    all controllers can be given the same disturbances.
-
-    Args:
-        slip: Probability of a slip, 0 to 1.
-        runs: Number of runs.
-        moves: Number of moves of each run.
-        seed: The seed, 0 or more.
-
-    Returns:
-        The action that replaces the intended one, or `STEADY`, shape (moves, runs).
-
-    Raises:
-        BadSettings: The slip is not a probability, there are no runs or moves, or the seed is negative.
-    """
-    if not 0 <= slip <= 1:
-        raise BadSettings("A slip must be a probability, from 0 to 1.", slip=slip)
-    if runs < 1 or moves < 1 or seed < 0:
-        raise BadSettings("Slips need at least one run and one move, and a seed of 0 or more.", runs=runs, moves=moves)
-    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
-    # Both are drawn for every move, so that the probability decides only which moves slip.
-    chance, drawn = rng.random((moves, runs)), rng.integers(len(MOVES), size=(moves, runs))
-    return np.where(chance < slip, drawn, STEADY).astype(np.int8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +109,7 @@ class Walks:
     touched: Flags | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "states", frozen(self.states, np.int64, (None, None), "states"))
-        object.__setattr__(self, "moves", frozen(self.moves, np.int64, (self.states.shape[1],), "moves"))
+        freeze(self, np.int64, states=(None, None), moves=(None,))
 
     def of(self, run: int) -> Ints:
         """Return the states of one run, (T,), without consecutive repeats."""
@@ -190,7 +124,7 @@ def walk(controller: Controller, path: GridPath, start: int, slips: Bytes, touch
         controller: The controller.
         path: The demonstrated path.
         start: State index of the start, the same for all runs.
-        slips: The slips, shape (moves, runs), as `draw_slips` returns them.
+        slips: The slips, shape (moves, runs), as `SlipModel.draw` returns them.
         touches: Moves that touch a scene and end a run, shape (n_states, 27); None without a scene.
 
     Returns:
@@ -297,9 +231,9 @@ def follows(walks: Walks) -> Flags:
         Flags of shape (N,).
     """
     domain = Domain(walks.path, phased=True)
-    phases, finished = start_all(domain, walks.states[0])
+    phases, finished = domain.start(walks.states[0])
     for states in walks.states[1:]:
-        phases, now = enter_all(domain, phases, states)
+        phases, now = domain.enter(phases, states)
         finished = finished | now
     return finished & arrives(walks)
 
@@ -351,22 +285,6 @@ def farthest_mm(walks: Walks) -> Floats:
     return np.asarray(nearest[walks.states].max(axis=0))
 
 
-def wilson(count: float, of: float) -> tuple[float, float]:
-    """Return the score interval of a share at 95 % (Wilson, "Probable inference", JASA 1927).
-
-    Args:
-        count: Number of successes; no whole number, where trials count as fewer independent ones.
-        of: Number of trials, at least 1.
-
-    Returns:
-        The lower and the upper bound, within 0 to 1.
-    """
-    share, z2 = count / of, NORMAL_95**2
-    middle = (share + z2 / (2 * of)) / (1 + z2 / of)
-    half = NORMAL_95 * sqrt(share * (1 - share) / of + z2 / (4 * of**2)) / (1 + z2 / of)
-    return max(0.0, middle - half), min(1.0, middle + half)
-
-
 @dataclass(frozen=True)
 class Odds:
     """The probability that a policy finishes, and its mean number of moves if it does (None if it never finishes)."""
@@ -375,7 +293,7 @@ class Odds:
     moves: float | None
 
 
-def odds(policy: Policy, slip: float, start: int, moves: int) -> Odds:
+def odds(policy: Policy, slip: SlipModel, start: int, moves: int) -> Odds:
     """Compute exactly the result of a policy whose moves slip and which stops outside the certified domain.
 
     Its rows, finishing and stopping are an absorbing Markov chain: the probability of being in each row is propagated,
@@ -383,7 +301,7 @@ def odds(policy: Policy, slip: float, start: int, moves: int) -> Odds:
 
     Args:
         policy: The policy.
-        slip: Probability of a slip, 0 to 1.
+        slip: How moves slip.
         start: State index of the start.
         moves: The greatest number of moves.
 
@@ -396,8 +314,7 @@ def odds(policy: Policy, slip: float, start: int, moves: int) -> Odds:
         return Odds(1.0, 0.0)
     row_after, finishes = _chain(policy)
     goes_on = row_after >= 0
-    chance = np.full(len(MOVES) + 1, slip / len(MOVES))
-    chance[-1] = 1 - slip  # the intended move is the last column
+    chance = np.append(slip.probability * slip.drawn, slip.intended)  # the intended move is the last column
     at, by_move = np.zeros(domain.n_rows), np.zeros(moves)
     at[domain.rows_of(phase, domain.path.grid.cells_of(start))] = 1.0
     for move in range(moves):
@@ -491,26 +408,6 @@ class ReplayPositions:
         commanded = self.grid.cells_of(self.plan[min(tick + 1, last)])
         actions = _action((commanded - self.grid.cells_of(states)).clip(-1, 1))
         return np.where((tick >= last) & (states == self.plan[last]), STOPS, actions), phases
-
-
-@dataclass(frozen=True, eq=False)
-class TwoLineRule:
-    """A controller that goes straight to the nearest waypoint (Chebyshev; the last of equals), then to each in turn.
-
-    On a path that does not cross itself, without slips and obstacles, each of its moves is optimal in the phase state
-    with the default gamma, where joining later pays more.
-    """
-
-    path: GridPath
-
-    def decide(self, tick: int, states: Ints, phases: Ints) -> tuple[Ints, Ints]:
-        """Update the phases with the states, and move each run towards its waypoint."""
-        domain, cells = Domain(self.path, phased=True), self.path.grid.cells_of(states)
-        phases, done = start_all(domain, states) if tick == 0 else enter_all(domain, phases, states)
-        apart = np.abs(self.path.cells - cells[:, None]).max(axis=2)
-        nearest = len(self.path.states) - 1 - apart[:, ::-1].argmin(axis=1)
-        ahead = self.path.cells[np.where(phases > 0, phases, nearest)]
-        return np.where(done, STOPS, _action((ahead - cells).clip(-1, 1))), phases
 
 
 def _action(steps: Ints) -> Ints:

@@ -1,0 +1,177 @@
+"""Routes of recordings, and of the hand-offs proposed in them. Storing a recording never starts a training."""
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import Field
+
+from skills.api.authorisation import Asking, needs
+from skills.api.dependencies import (
+    Actor,
+    Db,
+    Digest,
+    Incoming,
+    Limit,
+    RowCursor,
+    Strict,
+    Tell,
+)
+from skills.api.openapi import ends, gives, gives_page, makes, router_of, says
+from skills.api.pages import render
+from skills.api.responses import (
+    Giving,
+    say,
+    stored,
+)
+from skills.api.routes.pages import PageRoute, Picked
+from skills.formats import BYTES, MEDIA_TYPES
+from skills.library.operation import locks, overview
+from skills.library.operation.sweep import drop_contents, sweep_erased
+from skills.library.people import erasure
+from skills.library.recordings import proposals, recordings
+from skills.library.recordings.proposals import proposal_json
+from skills.library.recordings.recordings import find_recording, recording_json
+from skills.schemas import Page, ProposalState
+from skills.schemas.demos import Proposal, ProposalIn
+from skills.schemas.recordings import Recording, RecordingPreview, RecordingSummary, TableIn
+from skills.schemas.requests import DIGEST, SLUG, SlugField
+from skills.settings import MEBIBYTE
+
+uploads = router_of(tags=["demonstrations"])
+
+
+router = router_of(route_class=Strict, tags=["demonstrations"], max_body_size=MEBIBYTE)
+
+
+page_router = APIRouter(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
+
+
+RAW_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {kind: {"schema": {"type": "string", "format": "binary"}} for kind in (BYTES, *MEDIA_TYPES)},
+    }
+}
+
+
+class RecordingQuery(TableIn):
+    """Query parameters of an upload of a recording, with what a table or a LeRobot episode leaves open."""
+
+    surgeon: SlugField | None = Field(
+        None, description="The surgeon who was recorded; erasing this surgeon deletes the recording."
+    )
+
+
+@uploads.post(
+    "/recordings", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **makes(Recording, 404, 409, 410)
+)
+def add_recording(
+    upload: Incoming, asked: Annotated[RecordingQuery, Query()], db: Db, read: Tell, actor: Actor
+) -> Response:
+    """Store a recording, once for equal bytes, and propose the hand-offs in it."""
+    row, created = recordings.store_recording(db, upload.read_as(asked.said), actor, read, asked.surgeon)
+    return stored(recording_json(row), created, f"/recordings/{row.sha256}")
+
+
+@uploads.post("/recordings/preview", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **says(RecordingPreview))
+def preview_recording(upload: Incoming, asked: Annotated[TableIn, Query()], read: Tell) -> Response:
+    """Read a recording and return what would be understood of it, a table's columns included; nothing is stored."""
+    return say(recordings.preview(upload.read_as(asked.said), read))
+
+
+@router.get("/recordings", dependencies=[needs("reader")], **gives_page(Page[RecordingSummary], 410))
+def list_recordings(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None) -> Response:
+    """List recordings, the newest first."""
+    with db.reading() as session:
+        found = overview.newest_recordings(session, cursor, limit)
+        written = [recordings.summary_json(row, cut) for row, cut in found]
+        return give.page(written, limit, found[-1][0].row if found else None)
+
+
+@router.get("/recordings/{recording}", dependencies=[needs("reader")], **gives(Recording, 404))
+def get_recording(recording: Digest, db: Db, give: Giving) -> Response:
+    """Return a recording."""
+    with db.reading() as session:
+        return give(recording_json(recordings.find_recording(session, recording)))
+
+
+@router.delete("/recordings/{recording}", dependencies=[needs("uploader")], **ends(404, 409))
+def delete_recording(recording: Digest, db: Db, caller: Asking) -> None:
+    """Delete a recording without demonstrations permanently; allowed to its uploader and to admins."""
+    anybodys = caller.role == "admin"
+    with db.reading() as session:
+        stored, alone = erasure.deletable_recording(session, recording, caller.name, anybodys=anybodys)
+    recording = stored.sha256  # in full: the argument may be a prefix
+    drop_contents(db, [stored.row] if alone else [])
+    with db.writing([locks.recording(recording)]) as session:
+        erasure.delete_recording(session, recording, caller.name, anybodys=anybodys)
+    sweep_erased(db)
+    db.forget()
+
+
+Number = Annotated[int, Path(ge=1, le=1_000_000, description="The number of the proposal, counted from 1.")]
+
+
+@router.get("/proposals", dependencies=[needs("reader")], **gives_page(Page[Proposal], 404, 410))
+def list_proposals(
+    db: Db,
+    give: Giving,
+    state: Annotated[ProposalState | None, Query(description="Only those in this state.")] = None,
+    recording: Annotated[str | None, Query(pattern=DIGEST)] = None,
+    surgeon: Annotated[str | None, Query(pattern=SLUG)] = None,
+    suture: Annotated[
+        str | None, Query(pattern=SLUG, description="Only accepted ones, whose demonstration is of this suture type.")
+    ] = None,
+    limit: Limit = 50,
+    cursor: RowCursor = None,
+) -> Response:
+    """List the hand-offs proposed in recordings, those of the newest recording first.
+
+    A page may be shorter than `limit`, or empty, though `next` names another one.
+    """
+    asked = {"recording": recording, "surgeon": surgeon, "suture": suture}
+    with db.reading() as session:
+        found, following = proposals.list_proposals(session, limit, cursor, state=state, **asked)
+        return give.page([proposal_json(one) for one in found], len(found), following)
+
+
+@router.put("/recordings/{recording}/proposals/{number}", dependencies=[needs("uploader")], **says(Proposal, 404, 409))
+def decide_proposal(recording: Digest, number: Number, body: ProposalIn, db: Db, actor: Actor) -> Response:
+    """Reject a proposed hand-off, or open a rejected one again; `POST /recordings/{recording}/demos` accepts it."""
+    with db.reading() as session:
+        recording = find_recording(session, recording).sha256  # in full: the argument may be a prefix
+    with db.writing([locks.recording(recording)]) as session:
+        return say(proposal_json(proposals.decide(session, recording, number, body.state, body.note, actor)))
+
+
+@page_router.get("/pages/proposals", dependencies=[needs("reader")])
+def show_proposals(
+    request: Request,
+    caller: Asking,
+    db: Db,
+    state: Literal["", "open", "accepted", "rejected"] = "open",
+    recording: Picked = None,
+    surgeon: Picked = None,
+    suture: Picked = None,
+    cursor: RowCursor = None,
+) -> Response:
+    """Show proposed hand-offs, to be accepted, corrected or rejected; a form sends an empty text for any of them."""
+    asked = {"recording": recording or None, "surgeon": surgeon or None, "suture": suture or None}
+    with db.reading() as session:
+        found, following = proposals.list_proposals(session, overview.MOST, cursor, state=state or None, **asked)
+        return render(
+            request,
+            "proposals.html",
+            caller,
+            found=found,
+            following=following,
+            asked=asked | {"state": state},
+            surgeons=overview.surgeons_to_choose(session),
+            sutures=overview.all_suture_types(session),
+        )
+
+
+@page_router.get("/pages/recordings/{recording}/proposals", dependencies=[needs("reader")])
+def draw_proposals(recording: Digest, caller: Asking, db: Db, tell: Tell) -> Response:
+    """Return the paths of the tip in all proposals of a recording, for their small pictures."""
+    return say({"paths_mm": proposals.paths_of(db, recording, tell)}, headers={"Cache-Control": "no-store"})

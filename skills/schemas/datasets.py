@@ -1,0 +1,77 @@
+"""Datasets of demonstrations: answers and requests."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, StrictBool, StrictInt, model_validator
+
+from skills.fields import Sha256
+from skills.schemas import Given
+from skills.schemas.requests import ARM, DigestField, Name, Schema, SlugField, Text, shown
+
+
+class DatasetIn(Schema):
+    """A dataset to export: the demonstrations, the part of their recordings, and the contents of its README.
+
+    Without `demos`, all demonstrations are meant that fit the filters and the outcomes.
+    """
+
+    model_config = shown(
+        {"surgeons": ["kestrel"], "licence": "CC-BY-4.0", "name": "Running sutures"},
+        {"demos": ["0123456789abcdef" * 4], "whole": True, "version": "v3.0", "fps": 50, "split": "session"},
+    )
+
+    demos: Annotated[list[DigestField], Field(min_length=1, max_length=1000)] | None = Field(
+        default=None, description="These demonstrations, by their digests; by default all that fit the filters."
+    )
+    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = Field(
+        default=None, description="Only of these surgeons."
+    )
+    sutures: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = Field(
+        default=None, description="Only of these suture types."
+    )
+    outcomes: Literal["success", "any"] = Field(
+        default="success",
+        description="success leaves out demonstrations that are marked recovery or failure; any exports them in the "
+        "splits recovery and failure.",
+    )
+    whole: StrictBool = Field(
+        default=False,
+        description="Exports whole recordings, where all surgeons in them consent; otherwise an episode is the "
+        "interval of one hand-off.",
+    )
+    version: Literal["v2.1", "v3.0"] = Field(default="v2.1", description="The version of LeRobot's format.")
+    fps: Annotated[StrictInt, Field(ge=1, le=1000)] = Field(
+        default=30, description="Frames per second, at most the rate of the recordings."
+    )
+    split: Literal["surgeon", "session"] = Field(
+        default="surgeon", description="What is in one split only: all of a surgeon, or all of a recording."
+    )
+    arms: Annotated[list[Annotated[str, Field(pattern=ARM)]], Field(min_length=1, max_length=10)] | None = Field(
+        default=None, description="The arms of every episode; left out, those that all of the recordings have."
+    )
+    name: Name = Field(default="Needle hand-offs", description="The dataset's title.")
+    licence: Name = Field(default="unknown", description="Its licence, such as CC-BY-4.0.")
+    description: Text = Field(default="Not stated.", description="What it contains, for its README.")
+    procedure: Text = Field(default="Not stated.", description="How it was collected, for its README.")
+
+    @model_validator(mode="after")
+    def _named_or_filtered(self) -> Self:
+        if self.demos is not None and (self.surgeons is not None or self.sutures is not None):
+            raise ValueError("name demonstrations in demos, or filter them by surgeons and sutures, but not both")
+        if self.arms is not None and len({arm.lower() for arm in self.arms}) < len(self.arms):
+            raise ValueError("name each arm once")
+        return self
+
+
+class DatasetEpisode(Given):
+    """The origin of an episode of a dataset, which names none of this itself."""
+
+    recording: Sha256
+    demos: list[Sha256] = Field(description="The exported demonstrations in it; one, unless it is a whole recording.")
+
+
+class DatasetEpisodes(Given):
+    """The origins of a dataset's episodes, in the order of their numbers."""
+
+    whole: bool = Field(description="Whether each episode is a whole recording.")
+    episodes: list[DatasetEpisode]

@@ -1,0 +1,196 @@
+"""Demonstrations and proposed hand-offs: answers and requests."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from skills.demonstration.partner import Partner
+from skills.demonstration.quality import MotionReport
+from skills.demonstration.segments import TakenSegment
+from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
+from skills.gridworld.grid import MAX_HYSTERESIS, GridMode, PathReport
+from skills.gridworld.reward import RewardLevels
+from skills.schemas import ChosenGrid, DemoOutcome, Given, ProposalDecision, ProposalState
+from skills.schemas.requests import Name, Schema, SlugField, shown
+
+Hysteresis = Annotated[
+    float,
+    Field(
+        ge=0,
+        le=MAX_HYSTERESIS,
+        description="Cells by which a sample must be beyond a face of its cell to leave it; 0.25 keeps a tremor from "
+        "crossing a face again and again, and the report says what is lost in mm.",
+    ),
+]
+
+
+@schema
+@dataclass(frozen=True, kw_only=True)
+class DemoReport(PathReport, MotionReport):
+    """Measurements of a demonstration, and advice.
+
+    Attributes:
+        duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
+        backward_stamps: Samples of the entire recorded motion that were dropped because their stamp went back.
+        equal_samples: Samples of the demonstration that repeat the pose of the sample before to the last bit.
+        grid: The grid world of its path.
+        partner: The arm that takes the needle; null if it was not recorded.
+        advice: Sentences to the surgeon.
+    """
+
+    duplicate_stamps: Count
+    backward_stamps: Count
+    equal_samples: Count
+    grid: ChosenGrid
+    partner: Partner | None
+
+
+class Demonstration(Given):
+    """One hand-off cut out of a recording, with its measurements."""
+
+    id: Sha256
+    sha256: Sha256
+    recording: Sha256
+    surgeon: Slug
+    suture: Slug
+    arm: str
+    topic: str
+    frame: str
+    instrument: str
+    start_s: float
+    end_s: float
+    segment: TakenSegment = Field(description="Which part of the recording was taken.")
+    session: Slug | None
+    hysteresis: float = Field(description="Cells.")
+    state: Literal["active", "withdrawn"]
+    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off; null: not known.")
+    outcome_reason: str | None = Field(default=None, description="Why, in the words of whoever marked it.")
+    report: DemoReport
+    created_at: datetime
+    withdrawn_at: datetime | None
+
+
+class DemoPath(Given):
+    """A demonstration as its states in the grid, and as it was recorded."""
+
+    demo: Sha256
+    frame: str
+    grid: ChosenGrid
+    hysteresis: float
+    states: list[int]
+    path_mm: list[Point] = Field(description="The centres of the states.")
+    stamps_s: list[float]
+    recorded_mm: list[Point]
+
+
+class RewardMap(Given):
+    """The rewards of a demonstration other than `other`: `rewards[k]` is that of `states[k]`."""
+
+    demo: Sha256
+    sha256: Sha256
+    grid: ChosenGrid
+    levels: RewardLevels
+    states: list[int]
+    rewards: list[float]
+
+
+class DemoIn(Schema):
+    """A demonstration to cut out of a recording: the surgeon, the part, and the grid."""
+
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running"},
+        {"surgeon": "kestrel", "suture": "simple-running", "end_s": 1.1, "grid": "fit", "cell_mm": 4.0},
+    )
+
+    surgeon: SlugField = Field(description="The surgeon's pseudonym.")
+    suture: SlugField = Field(description="The suture type, such as simple-running.")
+    arm: Name | None = Field(default=None, description="Needed if several arms moved.")
+    topic: Name | None = Field(default=None, description="Needed if an arm was recorded on several topics.")
+    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
+        default=None, description="Start of the hand-off in the recording."
+    )
+    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
+        default=None, description="End of the hand-off in the recording."
+    )
+    segment: Literal["whole"] | Annotated[int, Field(ge=1, le=1_000_000)] | None = Field(
+        default=None,
+        description="A proposed hand-off, counted from 1, or whole. Without it and without times the only proposal is "
+        "taken; of several one must be named; where there is none, the whole recording is taken. The answer says which "
+        "part it was.",
+    )
+    grid: GridMode = Field(
+        default="auto", description="auto takes the paper's grid if the path lies in it, and fits one otherwise."
+    )
+    cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = Field(
+        default=None, description="Length of a cell's edge in a fitted grid; 5 by default."
+    )
+    hysteresis: Hysteresis = 0.0
+    session: SlugField | None = Field(
+        default=None, description="A name for recordings that were made together, such as 2026-11-23-a."
+    )
+    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off, where it is known.")
+    outcome_reason: Name | None = Field(default=None, description="Why; needed for a recovery or a failure.")
+
+    @model_validator(mode="after")
+    def _reason_with_outcome(self) -> Self:
+        if self.outcome is None and self.outcome_reason is not None:
+            raise ValueError("a reason needs an outcome")
+        _require_reason(self.outcome, self.outcome_reason)
+        return self
+
+
+class OutcomeIn(Schema):
+    """The outcome of a demonstration's hand-off, and its reason."""
+
+    model_config = shown({"outcome": "failure", "reason": "The needle fell."}, {"outcome": "success"})
+
+    outcome: DemoOutcome
+    reason: Name | None = Field(default=None, description="Needed for a recovery or a failure.")
+
+    @model_validator(mode="after")
+    def _why(self) -> Self:
+        _require_reason(self.outcome, self.reason)
+        return self
+
+
+def _require_reason(outcome: DemoOutcome | None, reason: str | None) -> None:
+    if outcome in ("recovery", "failure") and reason is None:
+        raise ValueError(f"a {outcome} needs a reason")
+
+
+class Proposal(Given):
+    """A proposed hand-off of a recording, and what was decided on it."""
+
+    recording: Sha256
+    number: int = Field(description="Its number in the recording, counted from 1.")
+    state: ProposalState = Field(
+        description="accepted: a demonstration was cut there, which shares at least half of the longer of the two."
+    )
+    arm: str
+    start_s: float = Field(description="Seconds since the recording's `origin_ns`.")
+    end_s: float
+    handover_s: float = Field(description="Transition from A1 to A2.")
+    found_by: str = Field(description="The source: stage, gesture, transfer, jaw or motion.")
+    reasons: list[str]
+    confidence: Fraction | None = Field(
+        description="Probability that the needle was given to another arm; null unless found by a transfer."
+    )
+    surgeon: Slug | None = Field(
+        description="Of its demonstration, else the only one that the recording was uploaded for."
+    )
+    suture: Slug | None = Field(description="Of its demonstration; null if there is none.")
+    demo: Sha256 | None = Field(description="The demonstration, active or withdrawn.")
+    outcome: DemoOutcome | None = Field(description="Of the demonstration.")
+    note: str | None = Field(description="Why it was rejected, or the reason of the outcome.")
+    created_at: datetime = Field(description="Of the recording.")
+
+
+class ProposalIn(Schema):
+    """The decision on a proposed hand-off. To accept it, cut a demonstration there."""
+
+    model_config = shown({"state": "rejected", "note": "The needle was only regrasped."}, {"state": "open"})
+
+    state: ProposalDecision
+    note: Name | None = None

@@ -1,0 +1,38 @@
+"""Jobs: requests for work, their state and their result."""
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import Field
+
+from skills.fields import Fraction
+from skills.schemas import Given, PolicyName
+
+
+class ServedNow(PolicyName):
+    """The policy version that a style serves."""
+
+    released_at: datetime
+
+
+class Job(Given):
+    """A job: work that was requested, its state and its result."""
+
+    id: str = Field(pattern="^[0-9a-f]{16}$")
+    kind: str = Field(description="training, retraining, playback, pictures, dataset or try.")
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    progress: Fraction
+    request: dict[str, Any] = Field(description="What was asked for, all defaults resolved.")
+    result: dict[str, Any] | None = Field(
+        description="What came of it. Of a training, `released` says whether its version is what the style serves "
+        "now, `was_released` whether the job released it, and where a release was asked for, `not_released_because` "
+        "and `remedy` say why not and what to do. Of a try, `steps` are those so far, also while it runs."
+    )
+    served: ServedNow | None = Field(
+        default=None, description="Of a training: what its style serves now; null where that is nothing."
+    )
+    did: str | None = Field(default=None, description="Of a POST: what the request did, in words.")
+    error: str | None
+    created_at: datetime
+    started_at: datetime | None
+    ended_at: datetime | None

@@ -1,0 +1,108 @@
+"""Surgeons, suture types and API keys: answers and requests."""
+
+from datetime import date, datetime
+from typing import Annotated, Literal
+
+from pydantic import AwareDatetime, Field
+
+from skills.fields import Slug
+from skills.schemas import Given, Handedness, SkillLevel
+from skills.schemas.requests import OWNER, Name, Schema, SlugField, Text, shown
+from skills.settings import Role
+
+
+class Consent(Given):
+    """The uses that a surgeon agreed to, and their last day."""
+
+    uses: list[Literal["training", "export", "atlas"]]
+    until: date | None = None
+
+
+class Surgeon(Given):
+    """A surgeon, known by a pseudonym."""
+
+    surgeon: Slug
+    skill_level: SkillLevel | None
+    handedness: Handedness | None
+    protocol: str | None
+    consent: Consent | None
+    created_at: datetime
+
+
+class ConsentIn(Schema):
+    """The uses that a surgeon agreed to, and their last day."""
+
+    uses: list[Literal["training", "export", "atlas"]]
+    until: date | None = None
+
+
+class SurgeonIn(Schema):
+    """A surgeon, by pseudonym; never a name."""
+
+    model_config = shown(
+        {
+            "skill_level": "expert",
+            "handedness": "right",
+            "consent": {"uses": ["training", "export"], "until": "2099-12-31"},
+        },
+        {},
+    )
+
+    skill_level: SkillLevel | None = Field(default=None, description="The surgeon's experience.")
+    handedness: Handedness | None = Field(default=None, description="The hand that the surgeon prefers.")
+    protocol: Name | None = Field(default=None, description="The study's protocol, such as an ethics number.")
+    consent: ConsentIn | None = Field(default=None, description="The uses that the surgeon agreed to.")
+
+
+class SutureType(Given):
+    """A suture type of the catalogue."""
+
+    suture: Slug
+    name: str
+    also_called: list[str]
+    family: str
+    description: str
+
+
+class SutureTypeIn(Schema):
+    """A suture type of the catalogue."""
+
+    model_config = shown(
+        {"name": "Simple running", "also_called": ["continuous"], "family": "running", "description": "One thread."}
+    )
+
+    name: Name
+    also_called: list[Name] = Field(default_factory=list, max_length=20)
+    family: Name
+    description: Text = ""
+
+
+class Key(Given):
+    """An API key, as an admin sees it: its owner and permissions; its secret is stored nowhere."""
+
+    key: str = Field(pattern=r"^[0-9a-f]{8}$", description="Its id, the part after `skills_`, which is no secret.")
+    owner: str = Field(description="Whose it is; events and releases bear this name.")
+    role: Literal["reader", "uploader", "trainer", "releaser", "admin"]
+    surgeons: list[Slug] | None = Field(description="The surgeons that it is restricted to; null: all.")
+    created_at: datetime
+    created_by: str
+    expires_at: datetime | None
+    revoked_at: datetime | None
+    state: Literal["active", "expired", "revoked"]
+
+
+class NewKey(Key):
+    """A key that was just created, with its secret."""
+
+    secret: str = Field(description="What to show as `X-API-Key`; nobody can show it again.")
+
+
+class KeyIn(Schema):
+    """An API key to create."""
+
+    model_config = shown({"owner": "a.laboratory", "role": "reader", "surgeons": ["kestrel"]})
+
+    owner: Annotated[str, Field(pattern=OWNER, description="Whose it is; events and releases bear this name.")]
+    role: Role
+    expires_at: AwareDatetime | None = None
+    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None

@@ -1,0 +1,157 @@
+"""Playbacks: the request, the verdict on a plan, and its headline; and a replay compared with its plan."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from skills.fields import Count, Point, Sha256, schema
+from skills.schemas import Given, PolicyName
+from skills.schemas.requests import LINE, DigestField, Schema, Size, Source, shown
+from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
+from skills.verification.probabilities import Doubt, Probability
+from skills.verification.scene_clearance import SceneReport
+from skills.verification.verdict import PlaybackReport
+
+
+class ErrorSources(Schema):
+    """For each size of an arm's errors its source, and the reason for its value."""
+
+    registration_mm: Source
+    registration_deg: Source
+    wrist_deg: Source
+    tip_bias_mm: Source
+    tip_noise_mm: Source
+    tip_correlation_s: Source
+
+
+class ArmErrorsIn(Schema):
+    """A laboratory's own errors of its arms, standard deviations along or about each axis (docs/errors.md)."""
+
+    name: Annotated[str, Field(min_length=1, max_length=60, pattern=LINE)]
+    registration_mm: Size = Field(description="Offset of PSM_M's base.")
+    registration_deg: Size = Field(description="Rotation of PSM_M's base about its remote centre.")
+    wrist_deg: Size = Field(description="Rotation of either arm's jaws about their hinge.")
+    tip_bias_mm: Size = Field(description="Offset of either arm that stays over a pass.")
+    tip_noise_mm: Size = Field(description="Offset of either arm that varies during a pass.")
+    tip_correlation_s: Size = Field(description="Correlation time of that noise.")
+    sources: ErrorSources
+
+
+class PlaybackIn(Schema):
+    """A playback: the plan to play in the simulator, and the errors of the arms to judge it under."""
+
+    model_config = shown({"plan": "0123456789abcdef" * 4}, {"plan": "0123456789abcdef" * 4, "errors": "calibrated"})
+
+    plan: DigestField
+    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = Field(
+        default=None, description="The errors of the arms that are to play it; by default those of the installation."
+    )
+
+    @property
+    def arm_errors(self) -> ArmErrors | None:
+        """The errors as a value of the domain."""
+        if self.errors is None or isinstance(self.errors, str):
+            return None if self.errors is None else NAMED[self.errors]
+        return checked_own(ArmErrors(**self.errors.model_dump()))
+
+
+@schema
+@dataclass(frozen=True, kw_only=True)
+class Verdict(PlaybackReport):
+    """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
+
+    Attributes:
+        failure_in_words: The failure as a sentence.
+        doubt: Probabilities of success in worlds that differ from the plan.
+        plan: Digest of the plan.
+        trajectory: Digest of the stamps and joints that were checked.
+        policy: The policy version that the plan follows.
+        frame: Frame of the plan.
+        scene: Distances from the plan's scene; null: it has none, so nothing was compared with tissue.
+        tissue: Whether the motion was compared with tissue.
+        stated_by: Source of the errors of the arms, the playback's request or the installation.
+        check_version: Version of the checks; a bag is given only of the present one.
+    """
+
+    failure_in_words: str | None
+    doubt: Doubt
+    plan: Sha256
+    trajectory: Sha256
+    policy: PolicyName
+    frame: str
+    scene: SceneReport | None
+    tissue: Literal["judged", "not given"]
+    stated_by: Literal["request", "installation"]
+    check_version: Count
+
+
+class StandingPolicy(PolicyName):
+    """The policy version that a plan follows, and whether it is released now."""
+
+    released: bool
+
+
+class PictureLinks(Given):
+    """Links to the pictures; all but the first are drawn after the verdict."""
+
+    picture: str
+    animation_mp4: str
+    animation_gif: str
+    joints: str
+    clearance: str
+
+
+class Headline(Given):
+    """A playback's headline: the verdict, the missing parts of the plan, and its probability of success."""
+
+    level: Literal["good", "caution", "bad"] = Field(
+        description="good: hands over, and succeeds as surely as the installation asks for a replay; bad: not "
+        "feasible, or surely succeeds in less than half of the worlds."
+    )
+    word: str = Field(description="The level in a word or two.")
+    text: str
+    errors: str = Field(
+        description="Name of the errors of the arms: those of the playback's request, or else of the installation."
+    )
+    probability: Probability | None = Field(description="Of the whole plan; null where it was not judged.")
+    counts: Literal["hand-over", "clearance"] | None = Field(
+        default=None,
+        description="The event of the probability: the needle is handed over in every pass, or, without a hand-off, "
+        "the motion only stays within reach and clear; null where it was not judged.",
+    )
+    not_judged: list[str] = Field(default=[], description="What the probability leaves out, in words.")
+    costs_most: str | None = Field(description="The error that costs the most, in words; null where none was judged.")
+
+
+class Playback(Given):
+    """The simulator's verdict on a plan."""
+
+    id: Sha256
+    sha256: Sha256
+    plan: Sha256
+    feasible: bool = Field(description="In an exact simulation, as far as the plan goes; read `headline`.")
+    headline: Headline | None = None
+    report: Verdict
+    picture: str
+    pictures: PictureLinks
+    created_at: datetime
+    policy: StandingPolicy
+
+
+class Comparison(Given):
+    """A recorded replay compared with a pass of its plan; triples are x, y and z."""
+
+    plan: Sha256
+    demo: Sha256
+    pass_index: Count = Field(alias="pass")
+    mean_mm: float
+    max_mm: float
+    start_mm: float = Field(description="Between the first samples.")
+    end_mm: float = Field(description="Between the last samples.")
+    dtw_mean_mm: Point
+    rmse_mm: Point
+    planned_s: float
+    recorded_s: float
+    tie_break: str
