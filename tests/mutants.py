@@ -372,9 +372,9 @@ GUARDS = (
     Guard(
         "skills/library/operation/history.py", 12,
         ("tests/api/test_edited_rows.py", "tests/api/test_rollback.py", "tests/library/test_history.py"),
-        ("edited_rows", "refuse_edited", "_is_signed", "covered_leaf", "is_right", "keep_signed"),
+        ("edited_rows", "refuse_edited", "_is_signed", "covered_leaf", "is_last_signed", "sign_some_history"),
     ),
-    Guard("skills/db/kept_heads.py", 8, ("tests/api/test_rollback.py", "tests/library/test_history.py")),
+    Guard("skills/db/saved_heads.py", 8, ("tests/api/test_rollback.py", "tests/library/test_history.py")),
     Guard(
         "skills/library/policies/releases.py", 33,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_scenes.py",

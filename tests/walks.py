@@ -37,7 +37,7 @@ COMMON += (
     "library/people/keys.py",
     "library/operation/locks.py",
 )
-COMMON += ("library/operation/history.py", "transparency.py")  # what is written is logged, whoever writes it
+COMMON += ("library/operation/history.py", "transparency/")  # what is written is logged, whoever writes it
 ONCE = ("find_plan", "time_parametrise", "stack", "plan_identity")
 PERIODIC = ("forget_erased", "forget_gone")  # part of no request, and a slow walk has them
 STARTING = ("confined_reader", "stated_errors")  # called once at the start of the service

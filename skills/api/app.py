@@ -17,7 +17,7 @@ from skills import __version__
 from skills.api.authentication import Access, Gate
 from skills.api.metrics import Observed, ServiceMetrics
 from skills.api.openapi import complete
-from skills.api.policy_cache import AtHand, PolicyCache
+from skills.api.policy_cache import CachedPolicyMiddleware, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
 from skills.api.routes import comparison, datasets, demos, operating, pages, people, plans, policies, recordings
@@ -25,7 +25,7 @@ from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
 from skills.jobs import Engine
-from skills.library.operation.history import keep_signed
+from skills.library.operation.history import sign_some_history
 from skills.library.people.catalogue import seed_catalogue
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.recordings.recordings import confined_reader
@@ -60,7 +60,7 @@ def create_app(settings: Settings) -> FastAPI:
                 with confined_reader(settings) as app.state.reader:
                     yield
             with suppress(SkillsError):  # what was written after the last signature; the next start signs it otherwise
-                await to_thread.run_sync(keep_signed, app.state.database, inf)
+                await to_thread.run_sync(sign_some_history, app.state.database, inf)
         finally:
             await to_thread.run_sync(app.state.engine.close)
             app.state.access.close()
@@ -130,7 +130,7 @@ def prepare_database(database: Database, settings: Settings) -> None:
     database.compare_history()
     with database.writing() as session:
         seed_catalogue(session)
-    keep_signed(database)
+    sign_some_history(database)
 
 
 def prepare_to_serve(database: Database, settings: Settings) -> None:
@@ -161,8 +161,8 @@ class Service(FastAPI):
         state = self.state
         failing = super().build_middleware_stack()
         assert isinstance(failing, ServerErrorMiddleware)  # the handler of status 500 is outermost, and stays so
-        at_hand = AtHand(failing.app, state.served, policies.get_policy, policies.router)
-        failing.app = Gate(at_hand, state.access, state.settings, state.database.history)
+        cached = CachedPolicyMiddleware(failing.app, state.served, policies.get_policy, policies.router)
+        failing.app = Gate(cached, state.access, state.settings, state.database.history)
         return Observed(Headers(HeadAsGet(failing)), state.metrics)
 
 

@@ -157,8 +157,8 @@ def _figures(found: Condition) -> Iterator[Metric]:
     )
     yield GaugeMetricFamily("skills_workers", "Workers that renewed their lease in time.", found.workers)
     yield GaugeMetricFamily("skills_database_bytes", "Size of the database.", found.database_bytes)
-    if found.verified_at is not None and found.found is not None:
-        yield GaugeMetricFamily("skills_history_faults", "Faults that the last verification found.", found.found)
+    if found.verified_at is not None and found.faults_found is not None:
+        yield GaugeMetricFamily("skills_history_faults", "Faults that the last verification found.", found.faults_found)
         yield GaugeMetricFamily(
             "skills_history_verified_timestamp_seconds",
             "Time at which a worker last verified the history.",

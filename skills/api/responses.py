@@ -45,7 +45,7 @@ from skills.library.policies.releases import outcomes_of
 from skills.library.policies.versions import Served, has_poses, pose_style_json, poses_of
 from skills.library.recordings.recordings import damaged
 from skills.settings import MEBIBYTE, Settings
-from skills.transparency import Note
+from skills.transparency.notes import Note
 
 Condition = Annotated[str | None, Header(max_length=2000)]
 PIECE_BYTES = 64 << 10  # written at once; at most two of them are buffered for a slow client

@@ -281,11 +281,11 @@ def verify(
         _say("\n".join(lines), as_json, whole=True, checked=lines)
         return
     from skills.db.session import Database
-    from skills.library.operation.history import keep_signed
+    from skills.library.operation.history import sign_some_history
     from skills.library.operation.inspection import inspect_installation
     from skills.library.recordings.recordings import confined_reader
     from skills.settings import settings
-    from skills.transparency import read_notes
+    from skills.transparency.notes import read_notes
 
     found: dict[str, Checked] = {}
     with (
@@ -295,7 +295,7 @@ def verify(
     ):
         with files():
             heads = None if head is None else read_notes(head.read_text())
-        keep_signed(database)
+        sign_some_history(database)
         for part in inspect_installation(
             database,
             reader.parse,

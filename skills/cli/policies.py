@@ -443,7 +443,7 @@ def policy_verify(
     as_json: AsJson = False,
 ) -> None:
     """Check offline that the service with this key signed exactly this file, and print what it said of it."""
-    from skills.transparency import read_envelope
+    from skills.transparency.statements import read_envelope
 
     with files():
         content, envelope = file.read_bytes(), read_envelope(signature.read_bytes())

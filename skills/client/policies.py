@@ -29,13 +29,13 @@ from skills.client.transport import keep
 from skills.errors import BadInput, Corrupt
 from skills.schemas.cards import PolicyCard
 from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
-from skills.schemas.given import SignedEnvelope
 from skills.schemas.operation import Job
 from skills.schemas.policies import NextStep, Policy, PolicySummary, Rollout, Version
 from skills.schemas.pose_styles import NextPose, PoseStyle
 from skills.schemas.scores import Progress, Score
 from skills.schemas.training import RetrainedStyle, Retraining
 from skills.schemas.tries import TryStep
+from skills.transparency.statements import SignedEnvelope
 
 if TYPE_CHECKING:
     from skills.learning.policy import Policy as LearntPolicy

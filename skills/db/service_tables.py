@@ -35,8 +35,8 @@ class Job(Base):
 
     `identity` is the digest of its resolved inputs: there is at most one active or succeeded job of an identity.
     `plan` is the digest of the plan that a playback or pictures belong to. `attempt` is the number of the current
-    attempt; its workflow is named "<row>-<attempt>". `told_at` is the time at which the attempt was enqueued in the
-    engine; of a batch, the time since which all its styles have rows. The surgeon is no foreign key: an erased
+    attempt; its workflow is named "<row>-<attempt>". `submitted_at` is the time at which the attempt was enqueued in
+    the engine; of a batch, the time since which all its styles have rows. The surgeon is no foreign key: an erased
     surgeon's jobs are deleted in steps, after the surgeon.
     """
 
@@ -54,8 +54,8 @@ class Job(Base):
     attempt: Mapped[int] = mapped_column(default=1)
     surgeon_row: Mapped[Number | None] = mapped_column(index=True)
     plan: Mapped[str | None] = mapped_column(Sha256)
-    asked_by: Mapped[str] = mapped_column(default="local")
-    told_at: Mapped[datetime | None]
+    requested_by: Mapped[str] = mapped_column(default="local")
+    submitted_at: Mapped[datetime | None]
     created_at: Mapped[datetime] = mapped_column(default=now)
     started_at: Mapped[datetime | None]
     ended_at: Mapped[datetime | None]
@@ -165,7 +165,7 @@ class DatasetChunk(Base):
 class Executor(Base):
     """A worker process and its last heartbeat; an `id` is never reused.
 
-    `found` is the number of faults that its last verification of the history found, which ended at `verified_at`.
+    `faults_found` are those of its last verification of the history, which ended at `verified_at`.
     """
 
     __tablename__ = "executors"
@@ -173,7 +173,7 @@ class Executor(Base):
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     beat_at: Mapped[datetime] = mapped_column(default=now)
     verified_at: Mapped[datetime | None]
-    found: Mapped[int | None]
+    faults_found: Mapped[int | None]
 
 
 class Key(Base):

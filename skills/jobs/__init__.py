@@ -38,17 +38,17 @@ if TYPE_CHECKING:
     from dbos import DBOSClient, DBOSConfig
 
 APPLICATION = "suture-skills"
-# Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and pictures and exports are made ASIDE.
-JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"
+# Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and pictures and exports are of low priority.
+JOBS, BATCHES, LOW_PRIORITY = "jobs", "batches", "low-priority"
 # Concurrent jobs of each queue in a worker process, so that no queue blocks another. The engine stores these limits in
 # its database for all workers, so they are constants, not settings; the load of a machine is set by its number of
 # workers. Two parts of batches: one is learnt while the next one is already there (`library.policies.batches`).
-QUEUES = {JOBS: 2, BATCHES: 2, ASIDE: 1}
+QUEUES = {JOBS: 2, BATCHES: 2, LOW_PRIORITY: 1}
 WORKFLOW = "perform_job"
 STEPS = "1"  # the engine's "application version": change it if and only if the sequence of steps in `workflows` changes
 # Polling interval of each queue. A poll takes 3 ms of processor time, in idle workers too; a part of a batch occupies a
 # worker for a second.
-POLLING_S = {JOBS: 0.3, BATCHES: 0.3, ASIDE: 1.0}
+POLLING_S = {JOBS: 0.3, BATCHES: 0.3, LOW_PRIORITY: 1.0}
 FAREWELL_S = 2.0  # timeout of `Engine.close`, within which it processes its pending calls
 CLOCK = "skills_clock"  # the name of `Clock` in the engine's URL
 
@@ -146,7 +146,7 @@ def _address(settings: Settings) -> str:
 
 def queue_of(kind: str) -> str:
     """Return the name of the queue for jobs of a kind."""
-    return {PART: BATCHES, PICTURES: ASIDE, EXPORT: ASIDE}.get(kind, JOBS)
+    return {PART: BATCHES, PICTURES: LOW_PRIORITY, EXPORT: LOW_PRIORITY}.get(kind, JOBS)
 
 
 def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:

@@ -202,8 +202,8 @@ def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
 def _patience_s(watch: Watch) -> int:
     """Return the timeout of draining in seconds.
 
-    It is 0 unless jobs of the queues `JOBS` or `BATCHES` run: those of `ASIDE` may take long, nobody waits for them,
-    and they are run again.
+    It is 0 unless jobs of the queues `JOBS` or `BATCHES` run: those of `LOW_PRIORITY` may take long, no user waits for
+    them, and they are run again.
     """
     return DRAIN_S if _at_work(watch, JOBS, BATCHES) else 0
 

@@ -26,7 +26,7 @@ from skills.db.session import Database
 from skills.errors import Busy, SkillsError
 from skills.jobs import JOBS, QUEUES, STEPS, WORKFLOW, drop, tell, workflow_id
 from skills.library.operation import locks
-from skills.library.operation.history import NAMED, Verified, keep_signed, verify_history
+from skills.library.operation.history import NAMED, Verified, sign_some_history, verify_history
 from skills.library.operation.jobs import ACTIVE, BATCH, PART, UNSYNCHRONISED, end_part, names_of
 from skills.settings import Settings
 
@@ -219,7 +219,7 @@ class Live:
 
     row: int
     attempt: int
-    told: bool
+    submitted: bool
     kind: str
 
     @property
@@ -273,7 +273,7 @@ class Watch:
     def round(self) -> None:
         """Write a heartbeat, sign the history, take over from dead workers, enqueue new jobs, read back outcomes."""
         self.beat()
-        if not keep_signed(self._database):
+        if not sign_some_history(self._database):
             return  # of another database than was signed last nothing is done
         self._take_over()
         live = self._live()
@@ -287,7 +287,7 @@ class Watch:
                 fail(self._database, job.row, job.attempt, reason, state)
             elif workflow.status in ENGINE_FAILED:
                 self._begin_again(job)
-        self._remember_told([job.row for job in live if not job.told])
+        self._note_submitted([job.row for job in live if not job.submitted])
         if self._swept_s is None or time.monotonic() - self._swept_s > SWEEP_S:
             self._forget_ended()
             if self._sweep():
@@ -305,11 +305,11 @@ class Watch:
             log.error("The history is not whole: %s: %s; run `skills verify`.", name, why)
         with self._database.writing(()) as session:
             mine = update(Executor).where(Executor.id == self._executor)
-            session.execute(mine.values(verified_at=now(), found=len(found)))
+            session.execute(mine.values(verified_at=now(), faults_found=len(found)))
 
     def leave(self) -> None:
         """Sign the last leaves of the history, and remove this worker from the table of executors."""
-        keep_signed(self._database, inf)
+        sign_some_history(self._database, inf)
         with self._database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == self._executor))
 
@@ -387,10 +387,10 @@ class Watch:
 
         Batches themselves are left out, because the engine runs only their parts.
         """
-        query = select(Job.row, Job.attempt, Job.told_at.is_not(None), Job.kind).where(Job.state.in_(ACTIVE))
+        query = select(Job.row, Job.attempt, Job.submitted_at.is_not(None), Job.kind).where(Job.state.in_(ACTIVE))
         query = query.where(Job.kind != BATCH)
         with self._database.reading() as session:
-            rows = session.execute(query.order_by(Job.told_at.is_not(None), Job.row).limit(AT_ONCE)).all()
+            rows = session.execute(query.order_by(Job.submitted_at.is_not(None), Job.row).limit(AT_ONCE)).all()
         return [Live(*row) for row in rows]
 
     def _workflows(self, live: Sequence[Live]) -> list[WorkflowStatus]:
@@ -411,7 +411,7 @@ class Watch:
         current.
         """
         row, attempt = map(int, workflow.split("-"))
-        again = {"state": "queued", "attempt": attempt + 1, "told_at": None}
+        again = {"state": "queued", "attempt": attempt + 1, "submitted_at": None}
         with self._database.writing([locks.job(row)]) as session:
             mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
             session.execute(update(Job).where(*mine).values(**again))
@@ -428,10 +428,11 @@ class Watch:
             )
             fail(self._database, job.row, job.attempt, reason)
 
-    def _remember_told(self, rows: Sequence[int]) -> None:
+    def _note_submitted(self, rows: Sequence[int]) -> None:
         if rows:
             # Rows that another transaction changes now are left for the next round: waiting for several rows in an
             # order of its own could deadlock.
-            untold = select(Job.row).where(Job.row.in_(rows), Job.told_at.is_(None)).with_for_update(skip_locked=True)
+            new = select(Job.row).where(Job.row.in_(rows), Job.submitted_at.is_(None))
             with self._database.writing(()) as session:
-                session.execute(update(Job).where(Job.row.in_(untold)).values(told_at=now()), **UNSYNCHRONISED)
+                mine = Job.row.in_(new.with_for_update(skip_locked=True))
+                session.execute(update(Job).where(mine).values(submitted_at=now()), **UNSYNCHRONISED)

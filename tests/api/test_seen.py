@@ -9,7 +9,7 @@ from sqlalchemy import select
 
 from skills.api.authentication import is_open
 from skills.db import Base
-from skills.db.row_visibility import OF_NOBODY, Only
+from skills.db.row_visibility import UNRESTRICTED_TABLES, Only
 from skills.db.service_tables import Job
 from skills.library.operation.jobs import to_tell
 from skills.library.people.keys import held, list_keys
@@ -227,5 +227,5 @@ def test_an_erased_surgeon_is_as_unknown_to_a_restricted_key_as_nobody(tmp_path:
 
 def test_every_table_has_a_rule_or_is_said_to_need_none():
     ruled = {table.__tablename__ for table in Only("somebody", frozenset({1})).rules}
-    assert ruled | set(OF_NOBODY) == set(Base.metadata.tables)
-    assert not ruled & set(OF_NOBODY)
+    assert ruled | set(UNRESTRICTED_TABLES) == set(Base.metadata.tables)
+    assert not ruled & set(UNRESTRICTED_TABLES)

@@ -21,7 +21,7 @@ from tests.waiting import until
 def test_a_row_that_nobody_told_of_runs(house: House):
     row = house.ask()
     assert house.ended(row).state == "succeeded"
-    until(lambda: house.job(row).told_at)
+    until(lambda: house.job(row).submitted_at)
 
 
 def test_telling_eight_times_runs_once_and_soon(house: House):

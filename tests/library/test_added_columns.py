@@ -11,8 +11,8 @@ from sqlalchemy.exc import DatabaseError
 
 from skills.db import Base, now
 from skills.db import revisions as revisions_module
-from skills.db.history import LEAVES, latest_leaves
-from skills.db.logged_rows import ADDED, Logged, logged, united
+from skills.db.leaves import LEAVES, latest_leaves
+from skills.db.logged_rows import ADDED, Logged, logged
 from skills.db.revisions import revisions, upgrade
 from skills.db.session import Database
 from skills.library.operation.backup import NOTHING, back_up, restore
@@ -50,7 +50,7 @@ def upgrade():
 
 
 def _forget() -> None:
-    for cached in (logged, united, revisions):
+    for cached in (logged, revisions):
         cached.cache_clear()
 
 

@@ -156,14 +156,14 @@ def test_jobs_that_had_not_ended_are_told_again_and_done(
     cases.add_demo(database)
     waiting, begun = cases.ask_training(database), cases.ask_training(database, seed=1)
     with database.writing() as session:
-        session.execute(text("UPDATE jobs SET told_at = created_at"))
+        session.execute(text("UPDATE jobs SET submitted_at = created_at"))
         session.execute(text("UPDATE jobs SET state = 'running' WHERE row = :row"), {"row": begun.row})
     back_up(database, tmp_path / "b.zip")
     restored = empty(OTHER[database.engine.dialect.name])
     restore(restored, tmp_path / "b.zip")
     for job in (waiting, begun):
         with restored.reading() as session:
-            assert session.get_one(Job, job.row).told_at is None
+            assert session.get_one(Job, job.row).submitted_at is None
         assert cases.work(restored, job).state == "succeeded"
 
 
@@ -173,7 +173,7 @@ def test_a_worker_of_the_restored_installation_carries_on(tmp_path: Path):
     before = House(backends.fresh("sqlite", tmp_path), tmp_path)
     row, begun = before.ask(), before.ask(state="running")
     with before.database.writing() as session:
-        session.execute(text("UPDATE jobs SET told_at = created_at"))
+        session.execute(text("UPDATE jobs SET submitted_at = created_at"))
     back_up(before.database, tmp_path / "b.zip")
     before.close()
     url = backends.blank("sqlite", tmp_path)

@@ -253,7 +253,7 @@ def many_jobs(database: Database, count: int) -> None:
                 "surgeon_row": row,
                 "progress": 0.0,
                 "attempt": 1,
-                "asked_by": "t",
+                "requested_by": "t",
                 "created_at": at,
             }
             for state in ("running", *["failed"] * (count - 1))

@@ -14,10 +14,11 @@ from sqlalchemy import Connection, func, insert, null, select, text, update
 from sqlalchemy.orm import Session
 
 from skills.db import Base, now
-from skills.db.history import CHECKPOINTS, LEAVES, latest_leaves, newest_checkpoint, take_notes
-from skills.db.kept_heads import keep_head
+from skills.db.change_notes import take_notes
+from skills.db.leaves import CHECKPOINTS, LEAVES, latest_leaves, newest_checkpoint
 from skills.db.logged_rows import COLUMNS_NOT_LOGGED, NOT_LOGGED, digests_of, logged
 from skills.db.models import Release, Surgeon
+from skills.db.saved_heads import save_head
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.db.tiles import TILES, stored_tiles
@@ -33,7 +34,9 @@ from skills.library.policies.releases import withdraw
 from skills.library.recordings import recordings
 from skills.library.recordings.recordings import stored_recording
 from skills.settings import Settings
-from skills.transparency import Checkpoint, SigningKey, Tree, inclusion_proof, leaf_hash, node_from, read_notes
+from skills.transparency.keys import SigningKey
+from skills.transparency.merkle import Checkpoint, Tree, inclusion_proof, leaf_hash, node_from
+from skills.transparency.notes import read_notes
 from tests import backends
 from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed, check_inclusion
@@ -673,7 +676,7 @@ def test_a_tree_that_was_changed_is_not_signed_on(full: Database):
 
 def test_a_head_that_cannot_be_kept_is_no_reason_to_stop(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     note = SigningKey(b"k" * 32).sign(Checkpoint("suture-skills/0", 0, Tree().root))
-    keep_head(tmp_path / "none" / "heads", note)
+    save_head(tmp_path / "none" / "heads", note)
     assert "could not be appended" in caplog.text
     assert "SKILLS_CHECKPOINTS" in caplog.text
     assert os.listdir(tmp_path) == []

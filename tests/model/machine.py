@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import rule
 from sqlalchemy import select
 
-from skills.db.history import newest_checkpoint
+from skills.db.leaves import newest_checkpoint
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback
 from skills.db.service_tables import Job as JobRow
 from skills.db.session import Database
@@ -37,7 +37,7 @@ from skills.library.operation.jobs import BATCH, PART
 from skills.library.perform import perform_job
 from skills.packing import sha256
 from skills.settings import Settings
-from skills.transparency import SigningKey
+from skills.transparency.keys import SigningKey
 from tests import backends
 from tests.api.service import CSV, Service
 from tests.library import cases

@@ -65,7 +65,6 @@ from skills.library.policies.training import near_limits, odds_limits, request_t
 from skills.library.policies.versions import about_next, poses_of, summary_json, version_json
 from skills.schemas import Page
 from skills.schemas.cards import PolicyCard
-from skills.schemas.given import SignedEnvelope
 from skills.schemas.operation import Job
 from skills.schemas.policies import NextStep, Policy, PolicySummary, Rollout, RolloutIn
 from skills.schemas.policies import Version as GivenVersion
@@ -74,7 +73,8 @@ from skills.schemas.requests import JOB, SLUG
 from skills.schemas.training import Retraining, RetrainingIn, TrainingIn
 from skills.schemas.tries import TryIn
 from skills.settings import MEBIBYTE
-from skills.transparency import read_notes
+from skills.transparency.notes import read_notes
+from skills.transparency.statements import SignedEnvelope
 
 job_router = router_of(route_class=Strict, tags=["jobs"], max_body_size=MEBIBYTE)
 

@@ -25,8 +25,8 @@ from sqlalchemy.orm import Session
 from skills import __version__
 from skills.db import Base, dump, rfc3339
 from skills.db.dump import Manifest
-from skills.db.kept_heads import set_aside
 from skills.db.models import SUCCESS, Demonstration, Erasure, LastUsed, PolicyVersion, Release, StoredRecording, Surgeon
+from skills.db.saved_heads import archive_heads
 from skills.db.service_tables import Event, Job, Key, record_event
 from skills.db.session import Database
 from skills.db.tiles import fill_tiles
@@ -208,7 +208,7 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
             fill_tiles(session.connection())
             told("erasures")
             restored = Restored(manifest, **_end_again(session, erasures))
-            session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(told_at=None))
+            session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(submitted_at=None))
             record_event(session, "local", "restore", "installation", manifest.created_at)
     sweep_erased(database)
     database.forget()
@@ -229,16 +229,16 @@ def accept_rollback(database: Database, erasures: Erasures = NOTHING) -> dict[st
         BadSettings: The file of kept heads cannot be set aside.
     """
     history = database.history
-    kept = history.kept_head()
+    kept = history.saved_head()
     with database.writing() as session:
         connection = session.connection()
         with suppress(NotReady):
             history.compare(connection, kept)
             raise Conflict("The database is the one whose history was kept last: there is nothing to accept.")
         history.compare(connection, None)
-        set_aside(history.heads_file)
+        archive_heads(history.heads_file)
         ended = _end_again(session, erasures)
-        session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(told_at=None))
+        session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(submitted_at=None))
         size = 0 if kept is None else kept.checkpoint.size
         record_event(session, "local", "accept", "rollback", f"{size} leaves")
     sign_history(database)

@@ -54,7 +54,7 @@ from skills.library.policies.versions import path_of, poses_of_demonstrations
 from skills.library.recordings.recordings import Teller, alike, cached_content, read_entry, recording_bytes
 from skills.packing import canonical, sha256
 from skills.settings import Settings
-from skills.transparency import Note
+from skills.transparency.notes import Note
 
 ROWS_AT_ONCE = 100
 WITH_OTHERS = {RecordingChunk, ParsedChunk, DatasetChunk}  # checked with the row that they belong to

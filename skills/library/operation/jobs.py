@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 
 from skills.db import now, rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
@@ -115,7 +115,7 @@ def settle(session: Session, batch: int) -> None:
     if counted["queued"]:
         return
     # A batch to whose styles others are still added has not ended.
-    complete = Job.told_at.is_not(None)
+    complete = Job.submitted_at.is_not(None)
     state = "failed" if counted["failed"] else "cancelled" if counted["cancelled"] else "succeeded"
     ended = {"state": state, "progress": 1.0, "result": counted, "error": _why(counted), "ended_at": now()}
     # Only the transaction that changes the state records the event.
@@ -256,7 +256,7 @@ def ask(
         request={**request},
         plan=request.get("plan"),
         surgeon_row=surgeon.row if surgeon else None,
-        asked_by=actor,
+        requested_by=actor,
     )
     session.add(job)
     session.flush()
@@ -268,7 +268,7 @@ def find_live(session: Session, kind: str, request: Mapping[str, object]) -> Job
     """Return the job of an equal request that is queued, running or done, even if the caller may not see it."""
     alike = select(Job).where(Job.identity == identity_of(kind, request), Job.state.in_(LIVE))
     # All rows, not only the caller's: an equal job must not be queued twice.
-    return session.scalar(alike.execution_options(**EVERYBODYS))
+    return session.scalar(alike.execution_options(**ALL_ROWS))
 
 
 def while_running(database: Database, row: int, attempt: int) -> Database:
@@ -314,7 +314,7 @@ def refuse_too_many(session: Session, actor: str, most: int) -> None:
         TooMany: The limit is reached.
     """
     # Parts are left out, because their batch counts as one.
-    mine = select(func.count()).where(Job.asked_by == actor, Job.state.in_(ACTIVE), Job.kind != PART)
+    mine = select(func.count()).where(Job.requested_by == actor, Job.state.in_(ACTIVE), Job.kind != PART)
     waiting = session.scalar(mine.select_from(Job)) or 0
     if waiting >= most:
         raise TooMany(

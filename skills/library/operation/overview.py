@@ -59,7 +59,7 @@ QUANTILES = (0.5, 0.95, 1.0)
 class Condition:
     """The figures of an installation; `seconds` are quantiles over the jobs that ended last, by kind.
 
-    `verified_at` is when a worker last verified the history, and `found` the number of faults.
+    `verified_at` is when a worker last verified the history, with `faults_found`.
     """
 
     seconds: dict[str, dict[float, float]]
@@ -68,7 +68,7 @@ class Condition:
     database_bytes: int
     last_event_at: datetime | None
     verified_at: datetime | None
-    found: int | None
+    faults_found: int | None
 
 
 def count_jobs(session: Session) -> dict[tuple[str, str], int]:
@@ -85,7 +85,7 @@ def condition_of(session: Session, lease_s: float) -> Condition:
         lease_s: A worker counts if its last heartbeat is at most so old, in s.
     """
     at, beats = now(), select(Executor.beat_at)
-    ended = select(Executor.verified_at, Executor.found).where(Executor.verified_at.is_not(None))
+    ended = select(Executor.verified_at, Executor.faults_found).where(Executor.verified_at.is_not(None))
     verified_at, found = session.execute(ended.order_by(Executor.verified_at.desc()).limit(1)).first() or (None, None)
     oldest = session.scalar(select(func.min(Job.created_at)).where(Job.state == "queued"))
     return Condition(
@@ -95,7 +95,7 @@ def condition_of(session: Session, lease_s: float) -> Condition:
         database_bytes=_size(session),
         last_event_at=session.scalar(select(Event.at).order_by(Event.row.desc()).limit(1)),
         verified_at=verified_at,
-        found=found,
+        faults_found=found,
     )
 
 

@@ -20,14 +20,16 @@ from sqlalchemy import Connection, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
-from skills.db.history import CHECKPOINTS, History, newest_checkpoint
+from skills.db.history import History
+from skills.db.leaves import CHECKPOINTS, newest_checkpoint
 from skills.db.logged_rows import as_bytes, logged
 from skills.db.models import PolicyVersion, Release
 from skills.db.session import Database
 from skills.errors import Busy, NotFound
 from skills.library.operation.history import covered_leaf, logged_leaf, sign_history
 from skills.library.people.catalogue import find_surgeon
-from skills.transparency import Note, attest, read_notes
+from skills.transparency.notes import Note, read_notes
+from skills.transparency.statements import attest
 
 DISCLOSED = {  # of the rows that a proof is about; the digests of their other columns reveal nothing without a guess
     "releases": ("row", "policy_row", "surgeon_row", "suture", "released_at", "released_by", "withdrawn_at"),

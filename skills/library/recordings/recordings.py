@@ -38,7 +38,7 @@ from skills.db.models import (
     RecordingUpload,
     StoredRecording,
 )
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
@@ -231,7 +231,7 @@ def send_ahead(database: Database, upload: Upload) -> int | None:
         return None
     same = select(StoredRecording.row).where(StoredRecording.sha256 == upload.sha256)
     with database.reading() as session:
-        if session.scalar(same.execution_options(**EVERYBODYS)) is not None:
+        if session.scalar(same.execution_options(**ALL_ROWS)) is not None:
             return None
     with database.writing(()) as session:
         row = _reserve(session)
@@ -298,7 +298,7 @@ def keep(
         Conflict: The bytes are already stored with other reading parameters.
     """
     same = select(StoredRecording).where(StoredRecording.sha256 == upload.sha256)
-    stored = session.scalar(same.execution_options(**EVERYBODYS))
+    stored = session.scalar(same.execution_options(**ALL_ROWS))
     entry = None if entry is not None and len(entry.data) > AT_ONCE_BYTES else entry
     if stored is not None:
         if ahead is not None:  # another upload of the same bytes was faster
@@ -562,7 +562,7 @@ def put_entry(session: Session, recording_row: int, entry: Entry) -> None:
 
 def is_cached(session: Session, stored: StoredRecording) -> bool:
     """Return whether a recording has an entry of this version and of its reading parameters."""
-    row = session.get(ParsedRecording, stored.row, execution_options=EVERYBODYS)
+    row = session.get(ParsedRecording, stored.row, execution_options=ALL_ROWS)
     return row is not None and (row.version, row.reading) == (READER_VERSION, _digest_of(stored.reading))
 
 
