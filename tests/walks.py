@@ -5,7 +5,8 @@
 A station is a public function that is called from another room, at its first call. Methods, private modules such as
 `_kernels`, the client, the start of the service, its periodic work and the modules that every room uses (`COMMON`) are
 left out of the list. The line above it counts everything: the functions of the package that were called, their files,
-and how often a call is in another room than the call before it. `ONCE` are functions of which a request needs one call.
+and how often a call is in another room than the call before it (`TOOLS` are no rooms). `ONCE` are functions of which a
+request needs one call.
 """
 
 import io
@@ -39,13 +40,25 @@ COMMON += (
 )
 COMMON += ("library/operation/history.py", "transparency/")  # what is written is logged, whoever writes it
 ONCE = ("find_plan", "time_parametrise", "stack", "plan_identity")
-PERIODIC = ("forget_erased", "forget_gone")  # part of no request, and a slow walk has them
-STARTING = ("confined_reader", "stated_errors")  # called once at the start of the service
+PERIODIC = ("forget_erased", "forget_gone", "_sweep", "is_right")  # part of no request, and a slow walk has them
+STARTING = ("confined_reader", "stated_errors", "migrate", "seed_catalogue", "create_app")  # called once by the service
+# Numbers, bytes and words: a reader knows them after the first page, and stays in the room that calls them.
+TOOLS = ("arrays.py", "arithmetic.py", "quaternions.py", "kinematics.py", "compiled.py", "packing.py", "fields.py")
+TOOLS += ("errors.py", "remedies.py", "settings.py", "logs.py", "transparency.py", "transparency")
 
 
 def room(file: str) -> str:
     """Return the folder, or the module, directly inside the package."""
     return file.removeprefix(f"{PACKAGE}/").partition("/")[0]
+
+
+def in_background(frame: FrameType | None) -> bool:
+    """Return whether a call is part of the service's start or of its periodic work, and of no request."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith(PACKAGE) and frame.f_code.co_name in (*PERIODIC, *STARTING):
+            return True
+        frame = frame.f_back
+    return False
 
 
 class Trace:
@@ -64,8 +77,9 @@ class Trace:
             return
         self.calls[code] += 1
         here = room(code.co_filename)
-        self.changes += here != self.here
-        self.here = here
+        if here not in TOOLS and not in_background(frame):
+            self.changes += here != self.here
+            self.here = here
         if code in self.stations:
             return
         file = code.co_filename.removeprefix(f"{PACKAGE}/")

@@ -499,7 +499,7 @@ def export_dataset(
     as_json: AsJson = False,
 ) -> None:
     """Export demonstrations as a LeRobot dataset, and verify it; the consent to export is required."""
-    from skills.formats.lerobot import refuse_existing
+    from skills.formats.lerobot.manifest import refuse_existing
 
     refuse_existing(to)
     sources: dict[str, EpisodeSource] = {}
@@ -561,7 +561,7 @@ def _save_with_videos(
     client: "Client", dataset: str, to: Path, sources: Mapping[str, "EpisodeSource"], version: Literal["v2.1", "v3.0"]
 ) -> None:
     """Download a dataset and add its videos, in a folder beside `to` that is renamed when all is there."""
-    from skills.formats.lerobot import refuse_existing
+    from skills.formats.lerobot.manifest import refuse_existing
     from skills.formats.lerobot.videos import add_videos, choose_videos
 
     recordings = [one.recording for one in client.dataset_episodes(dataset).episodes]

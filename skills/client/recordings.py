@@ -418,7 +418,7 @@ class Datasets(Connection):
             Corrupt: A file does not match the manifest; nothing is written.
             Problem: Of status 409 if a consent does not cover the export any more.
         """
-        from skills.formats.lerobot import check_dataset, refuse_existing, unpack_dataset  # slow to import
+        from skills.formats.lerobot.manifest import check_dataset, refuse_existing, unpack_dataset  # slow to import
 
         refuse_existing(to)
         with tempfile.TemporaryDirectory(prefix=".dataset-", dir=to.parent) as folder:

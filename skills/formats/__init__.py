@@ -7,17 +7,21 @@ The format is detected from the content, never from a name. A file is either rea
 
 import codecs
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import BinaryIO
 
 from skills.demonstration.recording import Recording
 from skills.errors import BadSettings, MixedFrames, UnknownFormat, UnreadableRecording
-from skills.formats import archive, ee_csv, jigsaws, rosbag, tables
+from skills.formats import archive
 from skills.formats.bag_folder import read_one, read_zip
 from skills.formats.bag_writer import write_bag, write_mcap
-from skills.formats.cells import SEPARATORS, Decimals, header_of, open_text
+from skills.formats.cells import Decimals, has_separator, header_of, open_text
 from skills.formats.columns import BASE
+from skills.formats.ee_csv import is_header, read_ee_csv
+from skills.formats.extract import is_extract, read_extract
+from skills.formats.jigsaws import looks_like_kinematics, read_jigsaws
 from skills.formats.mcap import MAGIC
+from skills.formats.rosbag import DB3_MAGIC, ROS1_MAGIC, read_rosbag
 from skills.formats.tables import TableReading, read_table
 from skills.remedies import Action, Remedy
 
@@ -26,19 +30,8 @@ __all__ = ["BYTES", "MEDIA_TYPES", "READABLE", "SUFFIXES", "media_type_of", "rea
 MCAP, ZIP, TABLE, TEXT = "application/vnd.mcap", "application/zip", "text/csv", "text/plain"
 ROSBAG1, SQLITE = "application/x-rosbag", "application/vnd.sqlite3"
 BYTES = "application/octet-stream"  # any of them: the format is detected from the content
-MEDIA_TYPES = {
-    MCAP: "an MCAP file",
-    ZIP: "a bag folder, an episode of LeRobot or a trial of JIGSAWS, zipped",
-    TABLE: "a table",
-    TEXT: "JIGSAWS kinematics",
-    ROSBAG1: "a ROS 1 bag",
-    SQLITE: "a .db3 bag",
-}
-READABLE = "; ".join(MEDIA_TYPES.values())  # for messages and pages
-SUFFIXES = {MCAP: ".mcap", ZIP: ".zip", TABLE: ".csv", TEXT: ".txt", ROSBAG1: ".bag", SQLITE: ".db3"}  # for dialogs
 
 _HEAD_BYTES = 65536
-_MAGIC = ((MAGIC, MCAP), (archive.MAGIC, ZIP), (rosbag.ROS1_MAGIC, ROSBAG1), (rosbag.DB3_MAGIC, SQLITE))
 _PARQUET = b"PAR1"
 _OTHERS = (
     (b"PK\x05\x06", "an empty zip archive"),
@@ -50,6 +43,63 @@ _OTHERS = (
     (b"\x89HDF", "HDF5; export a table"),
     (_PARQUET, "Parquet, a part of a LeRobot dataset; send an episode with its meta/info.json, as a zip"),
 )
+
+
+@dataclass(frozen=True)
+class FileFormat:
+    """A kind of file that can be a recording.
+
+    Attributes:
+        media_type: Its media type.
+        suffix: The suffix of its files, for dialogs.
+        name: Its name with an article, for messages and pages.
+        read: Its reader, of a file at its beginning.
+        magic: Its first bytes; empty for text.
+        is_text: Whether text with this first line may be of the format.
+        is_stated: Whether the caller may state more about it than a frame: it has none of it itself.
+    """
+
+    media_type: str
+    suffix: str
+    name: str
+    read: Callable[[BinaryIO, TableReading], Recording]
+    magic: bytes = b""
+    is_text: Callable[[str], bool] = lambda _: False
+    is_stated: bool = False
+
+    def begins(self, head: bytes) -> bool:
+        """Return whether a file with this head has the format's first bytes, or was cut within them."""
+        return bool(self.magic) and (head.startswith(self.magic) or self.magic.startswith(head))
+
+
+def _read_columns(file: BinaryIO, stated: TableReading) -> Recording:
+    """Read a table with a header of names: an ee_csv, unless the caller maps its columns, or of one arm."""
+    with open_text(file) as text:
+        names, _ = header_of(text)
+    file.seek(0)
+    read = read_ee_csv if not stated.column and is_header(names) else read_table
+    return read(file, stated)
+
+
+# A new format is one more entry here; the first that fits is taken.
+FORMATS = (
+    FileFormat(MCAP, ".mcap", "an MCAP file", lambda file, _: read_one(file), MAGIC),
+    FileFormat(
+        ZIP,
+        ".zip",
+        "a bag folder, an episode of LeRobot or a trial of JIGSAWS, zipped",
+        lambda file, stated: read_zip(file, stated.frame),
+        archive.MAGIC,
+    ),
+    FileFormat(TABLE, ".csv", "a table", lambda file, _: read_extract(file), is_text=is_extract),
+    FileFormat(TEXT, ".txt", "JIGSAWS kinematics", lambda file, _: read_jigsaws(file), is_text=looks_like_kinematics),
+    FileFormat(ROSBAG1, ".bag", "a ROS 1 bag", lambda file, _: read_rosbag([file], ".bag"), ROS1_MAGIC),
+    FileFormat(SQLITE, ".db3", "a .db3 bag", lambda file, _: read_rosbag([file], ".db3"), DB3_MAGIC),
+    FileFormat(TABLE, ".csv", "a table", _read_columns, is_text=has_separator, is_stated=True),
+)
+MEDIA_TYPES = {one.media_type: one.name for one in FORMATS}
+SUFFIXES = {one.media_type: one.suffix for one in FORMATS}
+READABLE = "; ".join(MEDIA_TYPES.values())  # for messages and pages
 _READ = f"Send one of these: {READABLE}."
 
 
@@ -88,32 +138,23 @@ def read_recording(
         BadRecording: It is of a supported format and cannot be used; `skills.errors` has the subclasses.
         BadSettings: An argument is impossible, or was given for a recording that says itself what it states.
     """
-    kind = media_type_of(file)
-    said = TableReading(rate_hz, frame, tuple(column), tuple(unit), decimal, table_arm, instrument, untimed)
-    if kind == TABLE and not _is_extract(file):
-        if not column and ee_csv.is_header(_names(file)):
-            return ee_csv.read_ee_csv(file, said)
-        return read_table(file, said)
-    for field in fields(said):
-        if field.name not in ("frame", "untimed") and getattr(said, field.name) != field.default:
-            raise BadSettings(
-                f"This is {MEDIA_TYPES[kind]}, which has its own stamps, columns and arms; omit {field.name}."
-            )
-    recording = read_zip(file, frame) if kind == ZIP else _READERS[kind](file)
+    stated = TableReading(rate_hz, frame, tuple(column), tuple(unit), decimal, table_arm, instrument, untimed)
+    found = format_of(file)
+    for field in fields(stated) if not found.is_stated else ():
+        if field.name not in ("frame", "untimed") and getattr(stated, field.name) != field.default:
+            raise BadSettings(f"This is {found.name}, which has its own stamps, columns and arms; omit {field.name}.")
+    recording = found.read(file, stated)
     own_bases = recording.format == "lerobot" and frame == BASE  # of each arm: PSM1_base, PSM2_base
-    return recording if own_bases else _in_frame(recording, frame)
-
-
-def _names(file: BinaryIO) -> list[str]:
-    """Return the names of a table's columns; the position is at the beginning afterwards."""
-    with open_text(file) as text:
-        names, _ = header_of(text)
-    file.seek(0)
-    return names
+    return recording if found.is_stated or own_bases else _in_frame(recording, frame)
 
 
 def media_type_of(file: BinaryIO) -> str:
-    """Return the media type of a file, detected from its content; the position is at the beginning afterwards.
+    """Return the media type of a file; errors are those of `format_of`."""
+    return format_of(file).media_type
+
+
+def format_of(file: BinaryIO) -> FileFormat:
+    """Return the format of a file, detected from its content; the position is at the beginning afterwards.
 
     Raises:
         UnknownFormat: It is of no supported format.
@@ -124,48 +165,29 @@ def media_type_of(file: BinaryIO) -> str:
     file.seek(0)
     if not head:
         raise UnreadableRecording("The file is empty; the transfer was interrupted or nothing was recorded.")
-    for magic, kind in _MAGIC:
-        if head.startswith(magic) or magic.startswith(head):  # the latter: truncated, reported by its reader
-            return kind
+    binary = next((one for one in FORMATS if one.begins(head)), None)
+    return binary or _format_of_text(head)
+
+
+def _format_of_text(head: bytes) -> FileFormat:
     for magic, name in _OTHERS:
         if head.startswith(magic):
             remedies = [Remedy(Action.CUT_EPISODE)] if magic == _PARQUET else []
             raise UnknownFormat(f"This is {name}. {_READ}", *remedies)
-    return _kind_of_text(head)
-
-
-def _kind_of_text(head: bytes) -> str:
     try:
         text = codecs.getincrementaldecoder("utf-8-sig")().decode(head)
     except UnicodeDecodeError:
         raise UnknownFormat(f"The content is neither a recording nor UTF-8 text. {_READ}") from None
-    first_line = text.split("\n", 1)[0]
-    if first_line.startswith(tables.FIRST):
-        return TABLE
-    if "\0" not in text and jigsaws.looks_like_kinematics(first_line):
-        return TEXT
     # Markup, JSON and binary data are refused here: the table reader would only complain about columns.
-    if "\0" in text or text.lstrip()[:1] in ("<", "{", "[") or not any(one in first_line for one in SEPARATORS):
+    is_plain = "\0" not in text and text.lstrip()[:1] not in ("<", "{", "[")
+    first_line = text.split("\n", 1)[0]
+    found = next((one for one in FORMATS if one.is_text(first_line)), None) if is_plain else None
+    if found is None:
         raise UnknownFormat(
             "The content is neither a table with a header of names, separated by commas, semicolons or tabs, nor "
             f"another known format. {_READ}"
         )
-    return TABLE
-
-
-def _is_extract(file: BinaryIO) -> bool:
-    first = file.read(len(tables.FIRST))
-    file.seek(0)
-    return first == tables.FIRST.encode()
-
-
-_READERS: dict[str, Callable[[BinaryIO], Recording]] = {
-    MCAP: read_one,
-    TABLE: tables.read_extract,
-    TEXT: jigsaws.read_jigsaws,
-    ROSBAG1: lambda file: rosbag.read_rosbag([file], ".bag"),
-    SQLITE: lambda file: rosbag.read_rosbag([file], ".db3"),
-}
+    return found
 
 
 def _in_frame(recording: Recording, frame: str | None) -> Recording:

@@ -1,4 +1,4 @@
-"""Bag folders: reading zips of them, joining the parts of split bags, and the stages in the tags next to a bag.
+"""Zips of a recording with several files.
 
 `read_zip` reads a zipped folder: a bag with the files that its recorder wrote next to it, one episode of a LeRobot
 dataset (see `lerobot`), or one JIGSAWS trial.
@@ -6,212 +6,46 @@ dataset (see `lerobot`), or one JIGSAWS trial.
     session/
         rosbag_1/metadata.yaml     the bag's files in order, and their numbers of messages
         rosbag_1/rosbag_1_0.mcap   one file or several; also .mcap.zstd, .db3, or .bag of ROS 1
-        *.json                     the tags of the recorders (see `read_labels`)
+        *.json                     the tags of the recorders (see `tags`)
         *.mp4 and others           ignored
 
 The bag is in one folder, anywhere in the archive. A bag in several files is joined topic by topic, in order of time.
 If there is a `metadata.yaml`, it must name exactly these files and count exactly these messages.
 
-Two recorders write tags: jhu-dvrk/data_collection and jhu-dvrk/dvrk_data. Both write JSON with a list `stages` of
-`{name, start, end}`, in the tags of a session or of one video. `start` and `end` are each one of
-
-    {"cpu_ts": ns, ...}                        nanoseconds since 1970, used directly
-    {"frame_absolute": k} or {"frame_idx": k}  a frame of the video, counted from 0: looked up in the video's sidecar
-    k                                          a frame as above, in older files; nanoseconds if too large for a frame
-
-A sidecar is JSON too, with `timestamps_ns` or `frames` of `{"cpu_ts": ns}`; it belongs to the tags with the same
-`video_file`, or to those named like it with `_tags` appended. Stages without an end, and frames without a sidecar, have
-no time and are skipped; other JSON files are ignored.
 """
 
-import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from tempfile import TemporaryFile
 from typing import IO, Any, BinaryIO
 
-import numpy as np
 import yaml
 import zstandard
 
-from skills.demonstration.recording import (
-    Format,
-    Integrity,
-    Joints,
-    Label,
-    Motion,
-    Recording,
-    Signal,
-    Topic,
-    recorded_motion,
-)
-from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnknownFormat, UnreadableRecording
+from skills.demonstration.recording import Format, Recording, Topic
+from skills.errors import NoUsableTopic, UnknownFormat, UnreadableRecording
 from skills.formats import jigsaws
 from skills.formats.archive import Archive, refusing, shown
+from skills.formats.join import in_time, join
 from skills.formats.lerobot import is_shadow, root_of
 from skills.formats.lerobot.episode import read_episode
 from skills.formats.mcap import NeedsRosbags, read_mcap
 from skills.formats.rosbag import Suffix, read_rosbag
+from skills.formats.tags import TAGS_BYTES, read_labels
 from skills.remedies import Action, Remedy
-
-Pairs = Iterable[tuple[str, Signal]]
-Json = dict[str, Any]
-
-
-def join(parts: Sequence[Recording]) -> Recording:
-    """Join the parts of one recording.
-
-    Args:
-        parts: In order of time, at least one.
-
-    Raises:
-        MixedFrames: A topic has different frames in different parts.
-        BackwardStamps, RepeatedStamps: As for one recording.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    faults = {topic: why for part in parts for topic, why in part.left_out}  # also if only one part has it
-    tips: list[Motion] = []
-    jaws: list[tuple[str, Signal]] = []
-    for topic in sorted({one.topic for part in parts for one in part.setpoints} - faults.keys()):
-        try:
-            tips += _motions([one for one in part.setpoints if one.topic == topic] for part in parts)
-        except SkillsError as error:
-            faults[topic] = str(error)
-    for topic in sorted({one.topic for part in parts for _, one in part.jaw_setpoints} - faults.keys()):
-        try:
-            jaws += _signals([pair for pair in part.jaw_setpoints if pair[1].topic == topic] for part in parts)
-        except SkillsError as error:
-            faults[topic] = str(error)
-    first = parts[0]
-    pedals, clutches = _signals(part.pedals for part in parts), [part.clutch for part in parts if part.clutch]
-    return Recording(
-        format=first.format,
-        integrity=_weakest([part.integrity for part in parts]),
-        motions=_motions(part.motions for part in parts),
-        jaws=_signals(part.jaws for part in parts),
-        clutch=_clutch(pedals, clutches),
-        topics=_topics(part.topics for part in parts),
-        joints=_joints(part.joints for part in parts),
-        masters=_motions(part.masters for part in parts),
-        grippers=_signals(part.grippers for part in parts),
-        pedals=pedals,
-        following=_signals(part.following for part in parts),
-        scales=_signals(part.scales for part in parts),
-        tools=tuple({arm: tool for part in parts for arm, tool in part.tools}.items()),
-        labels=in_time(label for part in parts for label in part.labels),
-        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
-        left_out=tuple(faults.items()),
-        setpoints=tuple(tips),
-        jaw_setpoints=tuple(jaws),
-    )
-
-
-def in_time(labels: Iterable[Label]) -> tuple[Label, ...]:
-    """Return labels in order of time, without duplicates."""
-    return tuple(sorted(set(labels), key=lambda label: (label.start_ns, label.end_ns, label.name)))
-
-
-def _weakest(all_of: list[Integrity]) -> Integrity:
-    kinds = set(all_of)
-    return all_of[0] if len(kinds) == 1 else "partial"
-
-
-def _motions(parts: Iterable[Iterable[Motion]]) -> tuple[Motion, ...]:
-    by_topic: dict[str, list[Motion]] = {}
-    for motions in parts:
-        for motion in motions:
-            by_topic.setdefault(motion.topic, []).append(motion)
-    return tuple(_joined_motion(pieces) for _, pieces in sorted(by_topic.items()))
-
-
-def _joined_motion(pieces: list[Motion]) -> Motion:
-    first, frames = pieces[0], sorted({piece.frame for piece in pieces})
-    if len(frames) > 1:
-        raise MixedFrames(
-            f"{first.topic} is in the frames {' and '.join(map(repr, frames))}; record each frame on a separate topic."
-        )
-    turns = [piece.rotation_xyzw for piece in pieces if piece.rotation_xyzw is not None]
-    whole = recorded_motion(
-        arm=first.arm,
-        topic=first.topic,
-        frame=first.frame,
-        stamps_ns=np.concatenate([piece.stamps_ns for piece in pieces]),
-        tip_mm=np.concatenate([piece.tip_mm for piece in pieces]),
-        rotation_xyzw=np.concatenate(turns) if len(turns) == len(pieces) else None,
-    )
-    # `recorded_motion` counts only what it drops between the pieces; each piece has counted its own before.
-    return replace(
-        whole,
-        duplicate_stamps=whole.duplicate_stamps + sum(piece.duplicate_stamps for piece in pieces),
-        backward_stamps=whole.backward_stamps + sum(piece.backward_stamps for piece in pieces),
-    )
-
-
-def _joints(parts: Iterable[Iterable[Joints]]) -> tuple[Joints, ...]:
-    by_topic: dict[str, list[Joints]] = {}
-    for joints in parts:
-        for one in joints:
-            by_topic.setdefault(one.topic, []).append(one)
-    return tuple(
-        Joints(
-            pieces[0].arm,
-            topic,
-            np.concatenate([piece.stamps_ns for piece in pieces]),
-            np.concatenate([piece.positions for piece in pieces]),
-            sum(piece.backward_stamps for piece in pieces),
-        )
-        for topic, pieces in sorted(by_topic.items())
-    )
-
-
-def _signals(parts: Iterable[Pairs]) -> tuple[tuple[str, Signal], ...]:
-    by_name: dict[str, list[Signal]] = {}
-    for pairs in parts:
-        for name, signal in pairs:
-            by_name.setdefault(name, []).append(signal)
-    return tuple((name, _joined_signal(pieces)) for name, pieces in sorted(by_name.items()))
-
-
-def _joined_signal(pieces: list[Signal]) -> Signal:
-    stamps_ns = np.concatenate([piece.stamps_ns for piece in pieces])
-    dropped = sum(piece.backward_stamps for piece in pieces)
-    return Signal(stamps_ns, np.concatenate([piece.values for piece in pieces]), pieces[0].topic, dropped)
-
-
-def _clutch(pedals: tuple[tuple[str, Signal], ...], clutches: list[Signal]) -> Signal | None:
-    """Return the clutch: the joined pedal of its topic, or else its signals in the parts, joined."""
-    if not clutches:
-        return None
-    same = [clutch for clutch in clutches if clutch.topic == clutches[0].topic]
-    return dict(pedals).get(clutches[0].topic) or _joined_signal(same)
-
-
-def _topics(parts: Iterable[Iterable[Topic]]) -> tuple[Topic, ...]:
-    counts: Counter[tuple[str, str]] = Counter()
-    for topics in parts:
-        for topic in topics:
-            counts[topic.name, topic.type] += topic.messages
-    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
-
 
 FILES = 1000
 METADATA = "metadata.yaml"
 METADATA_CHARACTERS = 1 << 20  # that of 60 topics with their QoS has 60,000
 METADATA_PARTS, METADATA_DEPTH = 100_000, 20  # events of the parser; of 60 topics at most 6000, in a depth of 9
-TAGS_BYTES = 32 << 20  # per JSON file: the frames of a day of video
 TEXTS = 10  # for one trial: its kinematics, a transcription, the meta files, a README
 UNZSTD_BYTES = 4 << 30
-LABELS = 10_000
 SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".bag")
 
-_NAME_LENGTH = 200
-_LATEST_FRAME = 10**12  # larger numbers are nanoseconds; this one is 17 minutes after midnight of 1 January 1970
-_LATEST_NS = 2**62  # in the year 2116; later stamps are taken for errors
 _DIRECTIVE = re.compile("(?:^|[\r\n\x85\u2028\u2029])%")
 
 
@@ -463,91 +297,3 @@ def _read_trial(archive: Archive, names: list[str]) -> Recording:
     rated = next((found for text in texts.values() if (found := jigsaws.read_meta(text).get(trial))), None)
     with archive.unpacked(kinematics[0]) as file:
         return jigsaws.read_jigsaws(file, "".join(texts[name] for name in transcriptions), rated)
-
-
-def read_labels(texts: Mapping[str, str]) -> tuple[Label, ...]:
-    """Return the stages in some JSON files, in order of time; duplicates are removed.
-
-    Args:
-        texts: Contents of the files, by file name.
-
-    Raises:
-        UnreadableRecording: A file is not JSON, has an invalid stage, or a stage that ends before it starts.
-    """
-    documents = {name: document for name, text in texts.items() if isinstance(document := _parsed(name, text), dict)}
-    frames = dict(_sidecars(documents))
-    labels: set[Label] = set()
-    for name, document in documents.items():
-        stages = document.get("stages", [])
-        if not isinstance(stages, list) or len(labels) + len(stages) > LABELS:
-            raise UnreadableRecording(f"{_short(name)}: `stages` is not a list of at most {LABELS} stages.")
-        stamps = _stamps_for(name, document, frames)
-        labels.update(label for stage in stages if (label := _label(name, stage, stamps)) is not None)
-    return tuple(sorted(labels, key=lambda label: (label.start_ns, label.end_ns, label.name)))
-
-
-def _parsed(name: str, text: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UnreadableRecording(f"{_short(name)} is not valid JSON ({type(error).__name__}); remove it.") from error
-
-
-def _sidecars(documents: Mapping[str, Json]) -> Iterator[tuple[str, list[Any]]]:
-    """Yield the timestamps of each video's frames by name.
-
-    Each list is yielded under two names: that of the video, and that of the sidecar without its suffix.
-    """
-    for name, document in documents.items():
-        stamps = document.get("timestamps_ns")
-        if stamps is None and isinstance(document.get("frames"), list):
-            stamps = [frame.get("cpu_ts") if isinstance(frame, dict) else None for frame in document["frames"]]
-        if isinstance(stamps, list):
-            yield PurePosixPath(name).stem, stamps
-            yield str(document.get("video_file")), stamps
-
-
-def _stamps_for(name: str, document: Json, frames: Mapping[str, list[Any]]) -> list[Any]:
-    video = PurePosixPath(name).stem.removesuffix("_tags")
-    return frames.get(str(document.get("video_file"))) or frames.get(video) or []
-
-
-def _label(name: str, stage: Any, stamps: list[Any]) -> Label | None:
-    if not isinstance(stage, dict) or not isinstance(stage.get("name"), str):
-        raise UnreadableRecording(f"{_short(name)} has a stage without a name.")
-    start, end = (_moment_ns(stage.get(edge), stamps) for edge in ("start", "end"))
-    if start is None or end is None:
-        return None
-    if end < start:
-        raise UnreadableRecording(f"{_short(name)} ends the stage {_printable(stage['name'])!r} before it starts.")
-    return Label(_printable(stage["name"]), "stage", start, end)
-
-
-def _moment_ns(moment: Any, stamps: list[Any]) -> int | None:
-    """Return nanoseconds since 1970; None where the time is unknown."""
-    frame = moment
-    if isinstance(moment, dict):
-        if _is_stamp(moment.get("cpu_ts")):
-            return int(moment["cpu_ts"])
-        frame = next((moment[key] for key in ("frame_absolute", "frame_idx", "frame") if key in moment), None)
-    elif _is_stamp(moment):
-        return int(moment)
-    if not isinstance(frame, int) or isinstance(frame, bool) or not 0 <= frame < len(stamps):
-        return None
-    return int(stamps[frame]) if _is_stamp(stamps[frame]) else None
-
-
-def _is_stamp(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and _LATEST_FRAME < value < _LATEST_NS
-
-
-def _printable(name: str) -> str:
-    """Return a stage's name with unprintable characters replaced.
-
-    JSON may contain unpaired surrogates, which cannot be encoded.
-    """
-    return "".join(letter if letter.isprintable() else "?" for letter in name[:_NAME_LENGTH])
-
-
-def _short(name: str) -> str:
-    return PurePosixPath(name).name[:80]

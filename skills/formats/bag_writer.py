@@ -26,9 +26,11 @@ import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import IO
 
 import numpy as np
+from jinja2 import Template
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
@@ -43,48 +45,10 @@ from skills.formats.topics import BOOL, FLOAT64, JOINT_STATE, JOY, POSE, STRING
 from skills.verification.timeline import ArmTrack, Timeline
 
 _NANO = 1_000_000_000
-_RULE = "=" * 80
-_HEADER = f"""{_RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_RULE}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
+_MESSAGES = files("skills.formats") / "messages"  # ROS's own definitions, with those of nested messages
 DEFINITIONS = {
-    POSE: f"""std_msgs/Header header
-geometry_msgs/Pose pose
-{_RULE}
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-{_RULE}
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-{_RULE}
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-{_HEADER}""",
-    JOINT_STATE: f"""std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-{_HEADER}""",
-    JOY: f"""std_msgs/Header header
-float32[] axes
-int32[] buttons
-{_HEADER}""",
-    BOOL: "bool data\n",
-    FLOAT64: "float64 data\n",
-    STRING: "string data\n",
+    kind: (_MESSAGES / f"{kind.rpartition('/')[2]}.msg").read_text()
+    for kind in (POSE, JOINT_STATE, JOY, BOOL, FLOAT64, STRING)
 }
 
 
@@ -363,39 +327,16 @@ def metadata_of(written: Written, file: str) -> bytes:
 
     In versions 4 to 8 the profiles are a text that has YAML in it, and Humble refuses the list of version 9.
     """
-    start_ns, count = written.first_ns or 0, sum(written.counts.values())
-    duration_ns = written.last_ns - start_ns
-    topics_with_count = "".join(
-        f"""
-    - topic_metadata:
-        name: {topic}
-        type: {kind}
-        serialization_format: cdr
-        {_QOS}: ""
-      message_count: {messages_on}"""
-        for (topic, kind), messages_on in written.counts.items()
+    start_ns = written.first_ns or 0
+    template = Template((_MESSAGES / "metadata.yaml").read_text(), keep_trailing_newline=True, autoescape=False)
+    text: str = template.render(
+        file=file,
+        start_ns=start_ns,
+        duration_ns=written.last_ns - start_ns,
+        count=sum(written.counts.values()),
+        topics=[(topic, kind, count) for (topic, kind), count in written.counts.items()],
     )
-    return f"""rosbag2_bagfile_information:
-  version: 5
-  storage_identifier: mcap
-  duration:
-    nanoseconds: {duration_ns}
-  starting_time:
-    nanoseconds_since_epoch: {start_ns}
-  message_count: {count}
-  topics_with_message_count:{topics_with_count or " []"}
-  compression_format: ""
-  compression_mode: ""
-  relative_file_paths:
-    - {file}
-  files:
-    - path: {file}
-      starting_time:
-        nanoseconds_since_epoch: {start_ns}
-      duration:
-        nanoseconds: {duration_ns}
-      message_count: {count}
-""".encode()
+    return text.encode()
 
 
 PREFIX = "/shown"

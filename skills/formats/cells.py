@@ -110,6 +110,11 @@ def _lines(text: TextIO, number: int) -> Iterator[str]:
         number += 1
 
 
+def has_separator(header: str) -> bool:
+    """Return whether a header line has a separator, as that of a table does."""
+    return any(one in header for one in SEPARATORS)
+
+
 def separator_of(header: str) -> str:
     """Return the separator of a table, from its header line.
 

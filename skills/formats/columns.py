@@ -8,7 +8,8 @@ read in the frame of the measured pose, if they are near it: setpoints in anothe
 arm lags behind. No fault of a setpoint refuses a recording, because nothing is learnt from it.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,22 @@ BASE = "base"  # as a frame: the base of each arm
 # of 290 mm is 11.4 inches, so a path in inches never exceeds this limit.
 OUTSIDE_MM = min(instrument.cannula_mm - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
 BEYOND_LIMIT = {"rad": 0.1, "mm": 10.0}  # ours: encoders overshoot a joint's limit by less; degrees and metres do not
+POSE_PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{part}" for part in "xyzw"))  # as in messages
+TOPICS = {  # the quantities that recorders write as columns, and the topics from which they take them
+    "local_pose": "/{}/local/measured_cp",
+    "pose": "/{}/measured_cp",
+    "joints": "/{}/measured_js",
+    "jaw": "/{}/jaw/measured_js",
+    "setpoint": "/{}/setpoint_cp",
+    "local_setpoint": "/{}/local/setpoint_cp",
+    "joint_setpoints": "/{}/setpoint_js",
+    "jaw_setpoint": "/{}/jaw/setpoint_js",
+}
+SETPOINTS = ("setpoint", "local_setpoint", "joint_setpoints", "jaw_setpoint")
+Quantity = tuple[str, str]  # an arm such as "PSM1", and a key of `TOPICS`
+# The numbers of a quantity in rad and mm: of a pose positions (T, 3) and, where they are known, quaternions (T, 4); of
+# any other one array (T, K). Apart, so that the recording's values need no copy of them.
+Parts = tuple[Floats, ...]
 _TURN_RAD = 2 * np.pi
 _JOINT_RAD = 7.0  # ours: more than any joint turns, less than 8 degrees
 APART_MM = 30.0  # ours: an arm lags by some mm, and by a cell of the paper's grid, 5 mm, at 100 mm/s and 50 ms
@@ -36,6 +53,24 @@ def scaled(values: Floats, factor: float) -> Floats:
     """Return values in mm or rad; infinite ones, where they overflow, are refused by the recording's values."""
     with np.errstate(over="ignore"):
         return values if factor == 1 else factor * values
+
+
+def topic_of(arm: str, kind: str) -> str:
+    """Return the topic of a quantity of an arm."""
+    return TOPICS[kind].format(arm)
+
+
+def pose_motion(arm: str, kind: str, frame: str, stamps_ns: Ints, pose: Parts) -> Motion:
+    """Return the motion of an arm from its "pose" or "local_pose" in a frame, at stamps of shape (T,)."""
+    tip_mm, *rotation = pose
+    return recorded_motion(
+        arm=arm,
+        topic=topic_of(arm, kind),
+        frame=frame,
+        stamps_ns=stamps_ns,
+        tip_mm=tip_mm,
+        rotation_xyzw=rotation[0] if rotation else None,
+    )
 
 
 def in_mm(joints: Floats) -> Floats:
@@ -85,7 +120,7 @@ def check_joints(topic: str, joints: Floats) -> None:
         )
 
 
-def posed(topic: str, joints: Floats, instrument: str | None) -> tuple[Floats, Floats]:
+def posed(topic: str, joints: Floats, instrument: str | None) -> Parts:
     """Compute poses from joints by forward kinematics with a stated instrument.
 
     Args:
@@ -118,8 +153,7 @@ def posed(topic: str, joints: Floats, instrument: str | None) -> tuple[Floats, F
             sample=row,
             joint=JOINTS[joint],
         )
-    tip_mm, rotation = forward(joints, instrument)
-    return tip_mm, quaternion_of(rotation)
+    return pose_of(joints, instrument)
 
 
 def check_outside(motion: Motion) -> None:
@@ -197,44 +231,63 @@ class ColumnSetpoints:
     jaws: list[tuple[str, Signal]] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
-    def add_tip(self, topic: str, stamps_ns: Ints, tip_mm: Floats, rotation_xyzw: Floats, measured: Motion) -> None:
-        """Add the commanded poses of a tip.
 
-        Args:
-            topic: The topic from which a recorder takes such columns.
-            stamps_ns: Integer nanoseconds, shape (T,).
-            tip_mm: Positions, shape (T, 3).
-            rotation_xyzw: Orientations, shape (T, 4).
-            measured: The measured motion of the arm, in the frame of the setpoints.
-        """
-        try:
-            tip = recorded_motion(
-                arm=measured.arm,
-                topic=topic,
-                frame=measured.frame,
-                stamps_ns=stamps_ns,
-                tip_mm=tip_mm,
-                rotation_xyzw=rotation_xyzw,
-            )
-        except SkillsError as error:
-            self.left_out.append((topic, str(error)))
-            return
-        commanded_mm, measured_mm = tip.tip_mm, measured.tip_mm
-        if not np.array_equal(tip.stamps_ns, measured.stamps_ns):  # samples were dropped
-            _, here, there = np.intersect1d(tip.stamps_ns, measured.stamps_ns, assume_unique=True, return_indices=True)
-            commanded_mm, measured_mm = commanded_mm[here], measured_mm[there]
-        offset_mm = commanded_mm - measured_mm
-        away_mm = np.sqrt(np.einsum("ij,ij->i", offset_mm, offset_mm))
-        if not (len(away_mm) and np.median(away_mm) <= APART_MM):
-            far_mm = float(np.median(away_mm)) if len(away_mm) else float("nan")
-            why = f"Its median distance from the measured tip is {far_mm:.3g} mm, above {APART_MM:g} mm: another frame."
-            self.left_out.append((topic, why))
-        else:
-            self.tips.append(tip)
+def setpoints_in(
+    values: Mapping[Quantity, Parts], motions: Sequence[Motion], instruments: Mapping[str, str], stamps_ns: Ints
+) -> ColumnSetpoints:
+    """Return the setpoints beside measured poses in the same frame; those of joints in the base of their arm.
 
-    def add_jaw(self, arm: str, topic: str, stamps_ns: Ints, angles_rad: Floats) -> None:
-        """Add the commanded angles of a jaw, shape (T,)."""
+    Args:
+        values: The numbers of each quantity; those of other quantities are not used.
+        motions: The measured motions.
+        instruments: The number of each arm's instrument, where it is known.
+        stamps_ns: Integer nanoseconds, shape (T,).
+    """
+    found = ColumnSetpoints()
+    for (arm, kind), parts in values.items():
+        if kind not in SETPOINTS:
+            continue
+        topic, pose = topic_of(arm, kind), parts
+        if kind == "joint_setpoints":
+            number = instruments.get(arm)
+            if (arm, "local_setpoint") in values or number is None or not np.isfinite(parts[0]).all():
+                why = "not used: the instrument is not known, a number is NaN or infinite, or poses are there too"
+                found.left_out.append((topic, why))
+                continue
+            topic, pose = topic_of(arm, "local_setpoint"), pose_of(parts[0], number)
         try:
-            self.jaws.append((arm, recorded_signal(stamps_ns, angles_rad, topic)))
+            if kind == "jaw_setpoint":
+                found.jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
+                continue
+            beside = topic_of(arm, "pose" if kind == "setpoint" else "local_pose")
+            measured = next((one for one in motions if one.topic == beside), None)
+            if measured is None:
+                raise NoUsableTopic(f"{arm} has no measured pose beside it in a known frame.")
+            tip = replace(pose_motion(arm, kind, measured.frame, stamps_ns, pose), topic=topic)
+            _check_near(tip, measured)
+            found.tips.append(tip)
         except SkillsError as error:
-            self.left_out.append((topic, str(error)))
+            found.left_out.append((topic, str(error)))
+    return found
+
+
+def pose_of(joints: Floats, instrument: str) -> Parts:
+    """Return the poses of the tip in the arm's base, from joints in rad and mm, shape (T, 6)."""
+    tip_mm, turned = forward(joints, instrument)
+    return tip_mm, quaternion_of(turned)
+
+
+def _check_near(tip: Motion, measured: Motion) -> None:
+    """Refuse setpoints that are far from the measured tip.
+
+    Raises:
+        MixedFrames: Their median distance is above `APART_MM`.
+    """
+    # samples may have been dropped from either
+    _, here, there = np.intersect1d(tip.stamps_ns, measured.stamps_ns, assume_unique=True, return_indices=True)
+    away_mm = np.linalg.norm(tip.tip_mm[here] - measured.tip_mm[there], axis=1)
+    far_mm = float(np.median(away_mm)) if len(away_mm) else np.nan
+    if not far_mm <= APART_MM:
+        raise MixedFrames(
+            f"Its median distance from the measured tip is {far_mm:.3g} mm, above {APART_MM:g} mm: another frame."
+        )

@@ -23,7 +23,7 @@ whose pose is 0 in every row, quaternion included, was not recorded, and is left
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import BinaryIO
 
 import numpy as np
@@ -39,50 +39,51 @@ from skills.demonstration.recording import (
     Topic,
     base_frames,
     recorded_joints,
-    recorded_motion,
     recorded_signal,
 )
 from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
 from skills.formats.cells import check_whole, header_of, open_text, read_numbers
-from skills.formats.columns import BASE, ColumnSetpoints, base_of, check_joints, check_outside, posed
-from skills.formats.tables import TableReading, check_steps, check_time, stamps_of
-from skills.kinematics import INSERTION, JOINTS
+from skills.formats.columns import (
+    BASE,
+    POSE_PARTS,
+    SETPOINTS,
+    Parts,
+    Quantity,
+    base_of,
+    check_joints,
+    check_outside,
+    pose_motion,
+    posed,
+    setpoints_in,
+    topic_of,
+)
+from skills.formats.tables import (
+    JOINT_NAMES,
+    POSITION,
+    QUATERNION,
+    TableReading,
+    check_steps,
+    check_time,
+    stamps_of,
+)
+from skills.kinematics import INSERTION
 from skills.remedies import Action, Remedy
 
 TIME = "timestamp"
 STEADY_MM, STEADY_RAD = 3.0, 0.05  # as of `skills.demonstration.partner`: a base that moves more has no single pose
 _FIRST = re.compile(r"psm\d+_(pose\.position\.x|(measured_)?js\[0\])")
 _USED = re.compile(
-    r"(?P<arm>psm\d+)_((?P<pose>pose|rcm_pose|sp)\.(position\.(?P<axis>[xyz])|orientation\.(?P<part>[xyzw]))"
+    r"(?P<arm>psm\d+)_((?P<pose>pose|rcm_pose|sp)\.(?P<part>position\.[xyz]|orientation\.[xyzw])"
     r"|(?P<jaw>jaw|jaw_sp)"
     r"|(measured_)?js\[(?P<joint>\d)\])"
 )
-_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-_JOINTS = tuple(f"q{k}" for k in range(1, len(JOINTS) + 1))
-_PARTS = {"js": _JOINTS, "jaw": ("jaw",), "jaw_sp": ("jaw",)}  # of any other kind `_POSE`
-_SETPOINTS = {"sp": "/{}/setpoint_cp", "jaw_sp": "/{}/jaw/setpoint_js"}
+_KINDS = {"pose": "pose", "rcm_pose": "local_pose", "sp": "setpoint", "jaw": "jaw", "jaw_sp": "jaw_setpoint"}
+_POSE = (*POSITION, *QUATERNION)
+_PARTS = {"joints": JOINT_NAMES, "jaw": ("jaw",), "jaw_setpoint": ("jaw",)}  # of any other kind `_POSE`
+_PLACES = {"local_pose": "local ", "setpoint": "setpoint ", "jaw_setpoint": "setpoint "}  # in the list of columns
 _KIND = "ee_csv"
 
-Parts = tuple[Floats, ...]  # the numbers of a group in mm and rad, an array for each of `_Group.parts`
-
-
-@dataclass(frozen=True)
-class _Group:
-    """The columns of one arm's pose, joints or jaw: their indices in the header."""
-
-    arm: str
-    kind: str
-    columns: tuple[int, ...]
-
-    @property
-    def parts(self) -> list[tuple[int, ...]]:
-        """The columns in the arrays as which values need them: positions apart from quaternions."""
-        return [self.columns] if self.kind in _PARTS else [self.columns[:3], self.columns[3:]]
-
-    @property
-    def topic(self) -> str:
-        """The topic of a setpoint."""
-        return _SETPOINTS[self.kind].format(self.arm)
+Indices = tuple[int, ...]  # of the columns of a quantity, in the header
 
 
 def is_header(names: Iterable[str]) -> bool:
@@ -115,107 +116,99 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
     with open_text(file) as text:
         names, _ = header_of(text)
     groups, faults = _groups(names)
-    time = _time(names)
+    if names.count(TIME) > 1:
+        raise _doubled(TIME)
+    time = names.index(TIME) if TIME in names else None
     check_time(TIME if time is not None else None, said)
     try:
-        stamps_ns, parts = _read(file, groups, time, said)
+        stamps_ns, values = _read(file, groups, time, said)
     except SkillsError as error:
-        measured = [one for one in groups if one.kind not in _SETPOINTS]
+        measured = {one: columns for one, columns in groups.items() if one[1] not in SETPOINTS}
         if len(measured) == len(groups):
             raise
-        stamps_ns, parts = _read(file, measured, time, said)
-        faults |= {one.topic: str(error) for one in groups if one.kind in _SETPOINTS}
+        stamps_ns, values = _read(file, measured, time, said)
+        faults |= {topic_of(*one): str(error) for one in groups if one[1] in SETPOINTS}
         groups = measured
-    return _recording(parts, stamps_ns, said, _columns(names, groups, time), faults)
+    return _recording(values, stamps_ns, said, _columns(names, groups, time), faults)
 
 
 def _read(
-    file: BinaryIO, groups: Sequence[_Group], time: int | None, said: TableReading
-) -> tuple[Ints, dict[tuple[str, str], Parts]]:
-    """Return the stamps, shape (T,), and the numbers of each arm and kind."""
+    file: BinaryIO, groups: Mapping[Quantity, Indices], time: int | None, said: TableReading
+) -> tuple[Ints, dict[Quantity, Parts]]:
+    """Return the stamps, shape (T,), and the numbers of each quantity."""
     file.seek(0)
     with open_text(file) as text:
         names, separator = header_of(text)
-        used = [*([[time]] if time is not None else []), *(part for one in groups for part in one.parts)]
+        apart = {one: [columns] if one[1] in _PARTS else [columns[:3], columns[3:]] for one, columns in groups.items()}
+        used = [*([[time]] if time is not None else []), *(list(part) for parts in apart.values() for part in parts)]
         numbers = read_numbers(text, names, used, separator, said.decimal, None if time is None else (time, "ns"))
     found = iter(numbers.groups)
     if time is not None:
         _check_whole(next(found))
         assert numbers.stamps_ns is not None
         check_steps(TIME, "ns", numbers.stamps_ns)
-    stamps_ns, read = stamps_of(numbers.stamps_ns, numbers.rows, said), dict[tuple[str, str], Parts]()
-    for one in groups:
-        parts = tuple(next(found) for _ in one.parts)
+    stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, said)
+    stamps_ns.setflags(write=False)  # so that all streams share it
+    values = {one: tuple(next(found) for _ in parts) for one, parts in apart.items()}
+    for (_, kind), (first, *others) in values.items():
         with np.errstate(over="ignore"):  # infinite ones are refused by the recording's values
-            if one.kind == "js":
-                parts[0][:, INSERTION] *= 1000.0  # the recorders write metres
-            elif one.kind not in _PARTS:
-                parts[0][:] *= 1000.0
-        for part in parts:
+            if kind == "joints":
+                first[:, INSERTION] *= 1000.0  # the recorders write metres
+            elif kind not in _PARTS:
+                first *= 1000.0
+        for part in (first, *others):
             part.setflags(write=False)  # so that the recording's values need no copy
-        read[one.arm, one.kind] = parts
-    stamps_ns.setflags(write=False)
-    return stamps_ns, read
+    return stamps_ns, values
 
 
-def _groups(names: Sequence[str]) -> tuple[list[_Group], dict[str, str]]:
-    """Return the groups of columns, and the topics of setpoints whose columns are not usable, with the fault of each.
+def _groups(names: Sequence[str]) -> tuple[dict[Quantity, Indices], dict[str, str]]:
+    """Return the columns of each quantity, and the topics of setpoints whose columns are not usable, with the faults.
 
     Raises:
         BadColumns: Another column is missing or there twice.
     """
-    found: dict[tuple[str, str], dict[str, list[int]]] = {}
+    found: dict[Quantity, dict[int, list[int]]] = {}
     for index, name in enumerate(names):
-        said = _USED.fullmatch(name)
-        if said is None:
+        if (said := _USED.fullmatch(name)) is None:
             continue
-        kind = said["pose"] or said["jaw"] or "js"
-        part = said["axis"] or (said["part"] and f"q{said['part']}") or (said["joint"] and f"q{int(said['joint']) + 1}")
-        found.setdefault((said["arm"].upper(), kind), {}).setdefault(part or "jaw", []).append(index)
-    groups, faults = [], {}
-    for (arm, kind), group in sorted(found.items()):
+        kind = _KINDS.get(said["pose"] or said["jaw"], "joints")
+        part = POSE_PARTS.index(said["part"]) if said["part"] else int(said["joint"] or 0)
+        found.setdefault((said["arm"].upper(), kind), {}).setdefault(part, []).append(index)
+    groups, faults = {}, {}
+    for quantity, columns in sorted(found.items()):
         try:
-            groups.append(_group(names, arm, kind, group))
+            groups[quantity] = _whole(names, quantity, columns)
         except BadColumns as error:
-            if kind not in _SETPOINTS:
+            if quantity[1] not in SETPOINTS:
                 raise
-            faults[_SETPOINTS[kind].format(arm)] = str(error)
+            faults[topic_of(*quantity)] = str(error)
     return groups, faults
 
 
-def _group(names: Sequence[str], arm: str, kind: str, found: Mapping[str, Sequence[int]]) -> _Group:
-    wanted = _PARTS.get(kind, _POSE)
-    doubled = [names[indices[0]] for indices in found.values() if len(indices) > 1]
-    if doubled:
-        raise BadColumns(f"The table has the column {doubled[0]!r} twice; export the table again.", doubled=doubled)
-    missing = [part for part in wanted if part not in found]
-    if missing or len(found) > len(wanted):
+def _whole(names: Sequence[str], quantity: Quantity, columns: Mapping[int, Sequence[int]]) -> Indices:
+    """Return the columns of a quantity in order; raises as `_groups`."""
+    (arm, kind), parts = quantity, _PARTS.get(quantity[1], _POSE)
+    for indices in columns.values():
+        if len(indices) > 1:
+            raise _doubled(names[indices[0]])
+    missing = [part for k, part in enumerate(parts) if k not in columns]
+    if missing or len(columns) > len(parts):
         which = f"{missing[0]} of {arm}'s {kind} is missing" if missing else f"{arm} has more joints than a PSM"
         raise BadColumns(f"The table is incomplete: {which}; export the table again.", missing=missing)
-    return _Group(arm, kind, tuple(found[part][0] for part in wanted))
+    return tuple(columns[k][0] for k in range(len(parts)))
 
 
-def _time(names: Sequence[str]) -> int | None:
-    count = names.count(TIME)
-    if count > 1:
-        raise BadColumns(f"The table has the column {TIME!r} twice; export the table again.", doubled=[TIME])
-    return names.index(TIME) if count else None
+def _doubled(name: str) -> BadColumns:
+    return BadColumns(f"The table has the column {name!r} twice; export the table again.", doubled=[name])
 
 
-def _columns(names: Sequence[str], groups: Sequence[_Group], time: int | None) -> tuple[Column, ...]:
+def _columns(names: Sequence[str], groups: Mapping[Quantity, Indices], time: int | None) -> tuple[Column, ...]:
     meant = {} if time is None else {time: ("t", "ns")}
-    for group in groups:
-        parts = _PARTS.get(group.kind, _POSE)
-        place = {"rcm_pose": "local ", "sp": "setpoint ", "jaw_sp": "setpoint "}.get(group.kind, "")
-        for index, part in zip(group.columns, parts, strict=True):
-            meant[index] = (f"{group.arm} {place}{part}", _unit(group.kind, part))
+    for (arm, kind), columns in groups.items():
+        for index, part in zip(columns, _PARTS.get(kind, _POSE), strict=True):
+            unit = "m" if part in POSITION or part == JOINT_NAMES[INSERTION] else "" if part in QUATERNION else "rad"
+            meant[index] = (f"{arm} {_PLACES.get(kind, '')}{part}", unit)
     return tuple(Column(name, *meant.get(index, ("", ""))) for index, name in enumerate(names))
-
-
-def _unit(kind: str, part: str) -> str:
-    if kind in _PARTS:
-        return "m" if part == _JOINTS[INSERTION] else "rad"
-    return "m" if part in ("x", "y", "z") else ""
 
 
 def _check_whole(times: Floats) -> None:
@@ -228,7 +221,7 @@ def _check_whole(times: Floats) -> None:
 
 
 def _recording(
-    parts: Mapping[tuple[str, str], Parts],
+    values: Mapping[Quantity, Parts],
     stamps_ns: Ints,
     said: TableReading,
     columns: tuple[Column, ...],
@@ -238,37 +231,38 @@ def _recording(
     joints: list[Joints] = []
     jaws: list[tuple[str, Signal]] = []
     left_out: list[tuple[str, str]] = list(faults.items())
-    posing = [arm for arm, kind in parts if kind == "pose" and any(part.any() for part in parts[arm, kind])]
-    for (arm, kind), values in parts.items():
-        if kind == "js":
-            (positions,) = values
-            topic = f"/{arm}/measured_js"
+    posing = [arm for (arm, kind), parts in values.items() if kind == "pose" and any(part.any() for part in parts)]
+    for (arm, kind), parts in values.items():
+        topic = topic_of(arm, kind)
+        if kind == "joints":
+            (positions,) = parts
             check_joints(topic, positions)
             joints.append(recorded_joints(arm, topic, stamps_ns, positions))
-            if (arm, "pose") not in parts:
-                tip_mm, rotation = posed(topic, positions, said.instrument)
-                posed_motion = _motion(arm, topic, base_of(arm, said.frame), stamps_ns, tip_mm, rotation)
-                motions.append(replace(posed_motion, from_joints=True))
+            if (arm, "pose") not in values:
+                pose = posed(topic, positions, said.instrument)
+                computed = pose_motion(arm, kind, base_of(arm, said.frame), stamps_ns, pose)
+                motions.append(replace(computed, from_joints=True))
         elif kind == "jaw":
-            jaws.append((arm, recorded_signal(stamps_ns, values[0][:, 0], f"/{arm}/jaw/measured_js")))
+            jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
         elif kind == "pose" and arm in posing:
-            frame = _frame(arm, posing, said)
-            motions.append(_motion(arm, f"/{arm}/measured_cp", frame, stamps_ns, *values))
+            motions.append(pose_motion(arm, kind, _frame(arm, posing, said), stamps_ns, parts))
         elif kind == "pose":
-            left_out.append((f"/{arm}/measured_cp", "All its numbers are 0: the arm was not recorded."))
-    for (arm, kind), values in parts.items():
-        if kind == "rcm_pose":
-            motion = next((one for one in motions if one.topic == f"/{arm}/measured_cp"), None)
-            local, why = _local(arm, stamps_ns, values, motion)
-            motions += [] if local is None else [local]
-            left_out += [(f"/{arm}/local/measured_cp", why)] if why else []
+            left_out.append((topic, "All its numbers are 0: the arm was not recorded."))
+    for (arm, kind), parts in values.items():
+        if kind == "local_pose":
+            seen = next((one for one in motions if one.topic == topic_of(arm, "pose")), None)
+            try:
+                motions.append(_local(arm, stamps_ns, parts, seen))
+            except SkillsError as error:  # no demonstration depends on it, where the arm has another pose
+                left_out.append((topic_of(arm, kind), str(error)))
     if not motions:
         raise NoUsableTopic("The table has the pose of no arm: all its poses are 0.")
     for motion in motions:
         check_outside(motion)
-    setpoints = _setpoints(parts, stamps_ns, motions)
+    setpoints = setpoints_in(values, motions, {}, stamps_ns)
     here = {motion.topic for motion in (*motions, *setpoints.tips)} | {one.topic for one in joints}
     here |= {signal.topic for _, signal in (*jaws, *setpoints.jaws)}
+    arms = sorted({motion.arm for motion in motions})
     return Recording(
         format="csv",
         integrity="none",
@@ -276,34 +270,11 @@ def _recording(
         jaws=tuple(jaws),
         topics=tuple(Topic(name, _KIND, len(stamps_ns)) for name in sorted(here)),
         joints=tuple(joints),
-        tools=()
-        if said.instrument is None
-        else tuple((arm, said.instrument) for arm in sorted({m.arm for m in motions})),
+        tools=() if said.instrument is None else tuple((arm, said.instrument) for arm in arms),
         left_out=(*left_out, *setpoints.left_out),
         columns=columns,
         setpoints=tuple(setpoints.tips),
         jaw_setpoints=tuple(setpoints.jaws),
-    )
-
-
-def _setpoints(parts: Mapping[tuple[str, str], Parts], stamps_ns: Ints, motions: Sequence[Motion]) -> ColumnSetpoints:
-    setpoints = ColumnSetpoints()
-    for (arm, kind), values in parts.items():
-        measured = next((one for one in motions if one.topic == f"/{arm}/measured_cp"), None)
-        topic = _SETPOINTS.get(kind, "").format(arm)
-        if kind == "jaw_sp":
-            setpoints.add_jaw(arm, topic, stamps_ns, values[0][:, 0])
-        elif kind == "sp" and measured is None:
-            setpoints.left_out.append((topic, "The arm has no measured pose beside it."))
-        elif kind == "sp" and measured is not None:
-            tip_mm, rotation = values
-            setpoints.add_tip(topic, stamps_ns, tip_mm, rotation, measured)
-    return setpoints
-
-
-def _motion(arm: str, topic: str, frame: str, stamps_ns: Ints, tip_mm: Floats, rotation_xyzw: Floats) -> Motion:
-    return recorded_motion(
-        arm=arm, topic=topic, frame=frame, stamps_ns=stamps_ns, tip_mm=tip_mm, rotation_xyzw=rotation_xyzw
     )
 
 
@@ -327,19 +298,24 @@ def _frame(arm: str, arms: Sequence[str], said: TableReading) -> str:
     return said.frame
 
 
-def _local(arm: str, stamps_ns: Ints, values: Parts, motion: Motion | None) -> tuple[Motion | None, str]:
-    """Return the motion in the arm's base, or the reason why `rcm_pose` is not one."""
-    topic = f"/{arm}/local/measured_cp"
-    try:
-        local = _motion(arm, topic, f"{arm}_base", stamps_ns, *values)
-    except SkillsError as error:  # no demonstration depends on it, where the arm has another pose
-        return None, str(error)
+def _local(arm: str, stamps_ns: Ints, pose: Parts, seen: Motion | None) -> Motion:
+    """Return the motion in the arm's base.
+
+    Args:
+        arm: The arm.
+        stamps_ns: Shape (T,).
+        pose: The numbers of `rcm_pose`.
+        seen: The arm's motion in another frame, if it has one.
+
+    Raises:
+        MixedFrames: `rcm_pose` is not known to be the tip in the arm's base.
+    """
+    local = pose_motion(arm, "local_pose", f"{arm}_base", stamps_ns, pose)
     if np.ptp(local.tip_mm, axis=0).max() < WIDE_MM:
-        return None, "It stands still: it may be the pose of the arm's base, and not of its tip."
-    if motion is None:
-        return None, "The arm has no other pose that would show whether it is the tip in the arm's base."
-    seen = Motion(arm, motion.topic, "other", motion.stamps_ns, motion.tip_mm, motion.rotation_xyzw)
-    bases = base_frames(Recording("csv", "none", (local, seen)))
+        raise MixedFrames("It stands still: it may be the pose of the arm's base, and not of its tip.")
+    if seen is None:
+        raise MixedFrames("The arm has no other pose that would show whether it is the tip in the arm's base.")
+    bases = base_frames(Recording("csv", "none", (local, replace(seen, frame="other"))))
     if not bases or bases[0].spread_mm > STEADY_MM or bases[0].spread_rad > STEADY_RAD:
-        return None, "No fixed transform leads from it to the arm's other pose, so its frame is not known."
-    return local, ""
+        raise MixedFrames("No fixed transform leads from it to the arm's other pose, so its frame is not known.")
+    return local

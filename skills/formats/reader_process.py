@@ -31,7 +31,8 @@ from skills.formats.cells import load_arrow
 from skills.formats.parsed import ParsedContent, parse_recording
 from skills.remedies import read_remedies
 from skills.sandbox import ProcessLimits
-from skills.sandbox.forked import ForkServer, Turns
+from skills.sandbox.forked import ForkServer
+from skills.sandbox.turns import Turns
 
 READER_VERSION = 1  # raised when equal bytes give another `ParsedContent`, so that cached ones are decoded again
 READ, PARSE, READY = f"{__name__}:read", f"{__name__}:parse", f"{__name__}:get_ready"

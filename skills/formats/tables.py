@@ -1,4 +1,4 @@
-"""CSV tables of one arm's motion: with named columns, or as dVRK recorders extract them from a bag.
+"""CSV tables of one arm's motion, with named columns.
 
 `read_table` reads one row per sample, with these columns:
 
@@ -22,23 +22,13 @@ and m), and that of joint tables of calibrations, `measured_q1` ... `measured_q6
 and m, a rotation vector). Roll, pitch and yaw are those of KDL's `Rotation::RPY`, which the dVRK's tools use:
 R = Rz(yaw) Ry(pitch) Rx(roll).
 
-`read_extract` reads the extract of one pose topic:
-
-    # Topic: /PSM1/local/measured_cp
-    # Type: geometry_msgs/msg/PoseStamped
-    timestamp,header.frame_id,header.stamp.nanosec,header.stamp.sec,pose.orientation.w,...
-
-Its columns are the message's fields by their dotted names, in any order: metres, a unit quaternion, the header's stamp.
-`timestamp`, the time of reception, and all other columns are not used.
-
 A table has no checksum, so its integrity is "none".
 """
 
 import re
-from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import BinaryIO, TextIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -55,18 +45,12 @@ from skills.demonstration.recording import (
 from skills.errors import (
     BadColumns,
     BadSettings,
-    MixedFrames,
     NoUsableTopic,
-    UnreadableRecording,
 )
-from skills.formats import topics
 from skills.formats.cells import (
-    LINE_CHARACTERS,
     NS_PER,
     Decimals,
     check_last_number,
-    check_whole,
-    csv_rows,
     ends_with_line,
     header_of,
     is_number,
@@ -480,87 +464,3 @@ def _signal(table: _Table, quantity: str, name: str) -> Signal | None:
     if quantity not in table.columns:
         return None
     return recorded_signal(table.stamps_ns, table.columns[quantity], f"{TOPIC} {name}")
-
-
-# ---- extracts ----------------------------------------------------------------------------------------------------
-
-FIRST = "# Topic:"
-
-_SECOND = "# Type:"
-_HEADER_LINE = 3
-_FRAME, _SEC, _NANOSEC = "header.frame_id", "header.stamp.sec", "header.stamp.nanosec"
-_PLACES = {
-    topics.POSE: ("pose.position.", "pose.orientation."),
-    topics.TRANSFORM: ("transform.translation.", "transform.rotation."),
-}
-
-
-def read_extract(file: BinaryIO) -> Recording:
-    """Read one arm's motion from the extract of its pose topic.
-
-    Args:
-        file: The file, at its beginning; UTF-8, comma-separated.
-
-    Returns:
-        The recording, in millimetres.
-
-    Raises:
-        NoUsableTopic: The topic is not a pose of a PSM.
-        BadColumns: A column is missing or duplicate.
-        UnreadableRecording: A row of another length, a cell that is not a number, no rows.
-        MixedFrames, NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: See `skills.errors`.
-    """
-    check_whole(file)
-    with open_text(file, "Extract") as text:
-        first, second = text.readline(LINE_CHARACTERS), text.readline(LINE_CHARACTERS)
-        topic, kind = first.removeprefix(FIRST).strip(), second.removeprefix(_SECOND).strip()
-        arm = topics.arm_of_pose(topic, kind)
-        if arm is None:
-            raise NoUsableTopic(f"The table is of {topic[:200]} ({kind[:200]}), which is not the pose of a PSM.")
-        stamps_ns, poses, frames = _samples(text, _PLACES[kind])
-    if len(frames) > 1:
-        raise MixedFrames(
-            f"{topic} has poses in {len(frames)} frames; record each frame on a separate topic.", frames=frames[:20]
-        )
-    motion = recorded_motion(
-        arm=arm,
-        topic=topic,
-        frame=frames[0],
-        stamps_ns=stamps_ns,
-        tip_mm=1000.0 * poses[:, :3],  # the recorders write metres
-        rotation_xyzw=poses[:, 3:],
-    )
-    return Recording(format="csv", integrity="none", motions=(motion,), topics=(Topic(topic, kind, len(poses)),))
-
-
-def _samples(text: TextIO, parts: tuple[str, str]) -> tuple[Ints, Floats, list[str]]:
-    """Return stamps, shape (T,), positions and quaternions, shape (T, 7), and the distinct frames."""
-    rows = csv_rows(text, first_line=_HEADER_LINE)
-    columns = _columns(next(rows, []), parts)
-    stamps, numbers, frames = array("q"), array("d"), dict[str, None]()
-    for row in rows:
-        try:
-            sec, nanosec, frame, *pose = (row[column] for column in columns)
-            stamps.append(int(sec) * 1_000_000_000 + int(nanosec))
-            numbers.extend(map(float, pose))
-        except (ValueError, IndexError, OverflowError):
-            line = rows.line_num + _HEADER_LINE - 1
-            raise UnreadableRecording(
-                f"Row {line} is not a pose with a stamp; extract the bag again.", row=line
-            ) from None
-        frames[frame] = None
-    if not stamps:
-        raise UnreadableRecording("The table has a header and no rows.")
-    return np.frombuffer(stamps, dtype=np.int64), np.frombuffer(numbers).reshape(-1, 7), list(frames)
-
-
-def _columns(header: list[str], parts: tuple[str, str]) -> list[int]:
-    """Return the column indices of the stamp, the frame, the position and the quaternion."""
-    place, turn = parts
-    names = [_SEC, _NANOSEC, _FRAME, *(place + axis for axis in "xyz"), *(turn + axis for axis in "xyzw")]
-    wrong = [name for name in names if header.count(name) != 1]
-    if wrong:
-        raise BadColumns(
-            f"The table must have the column {wrong[0]} exactly once; extract the bag again.", missing=wrong
-        )
-    return [header.index(name) for name in names]

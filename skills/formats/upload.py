@@ -12,40 +12,38 @@ which reduces a session's gigabytes; every other message is copied unchanged, wi
 Checksums of the original are verified while copying, and the copy has its own.
 """
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO
 
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Channel, Message, Schema
 from mcap.writer import Writer
 
 from skills.demonstration.recording import Label, Topic
-from skills.errors import BadInput, UnreadableRecording
+from skills.errors import BadInput, SkillsError, UnreadableRecording
 from skills.formats import rosbag
 from skills.formats.archive import pack
 from skills.formats.bag_folder import (
     METADATA,
-    TAGS_BYTES,
     check_counts,
     in_order,
-    read_labels,
     read_metadata,
     suffix_of,
     unzstd,
 )
+from skills.formats.checksums import digest_of
 from skills.formats.jigsaws import trials
 from skills.formats.lerobot import INFO
 from skills.formats.mcap import MAGIC
 from skills.formats.mcap.reader import NOTES
 from skills.formats.mcap.records import RECOVER
+from skills.formats.tags import TAGS_BYTES, read_labels
 from skills.remedies import Action, Remedy, did_you_mean
 
 PICTURES = frozenset(
@@ -64,7 +62,6 @@ PICTURES = frozenset(
     }
 )
 _RECORD_BYTES = 4 << 30  # generous, because the user's own file is trusted
-_PIECE = 1 << 20
 _NAME = "bag"  # the original file names may identify a person
 
 Progress = Callable[[int], None]  # called with the number of bytes processed since the last call
@@ -164,7 +161,7 @@ def _one_file(bag: Bag, folder: Path, progress: Progress) -> Path:
         if not any(topic.type in PICTURES for topic in topics):
             _check(bag, topics)
             return files[0]
-    digests = [digest_of(file, progress) for file in bag.files]
+    digests = [_digest(file, progress) for file in bag.files]
     out = folder / f"{_NAME}.mcap"
     with out.open("wb") as file:
         if files[0].suffix == ".mcap":
@@ -242,14 +239,9 @@ def _by_number(name: str) -> tuple[int, str]:
 # ---- copies without pictures -----------------------------------------------------------------------------------------
 
 
-def digest_of(path: Path, progress: Progress = ignore) -> str:
-    """Return the SHA-256 of a file, in hex."""
-    seen = hashlib.sha256()
+def _digest(path: Path, progress: Progress) -> str:
     with path.open("rb") as file:
-        while data := file.read(_PIECE):
-            seen.update(data)
-            progress(len(data))
-    return seen.hexdigest()
+        return digest_of(file, lambda data: progress(len(data)))
 
 
 def origin(digests: Sequence[str], topics: Iterable[Topic]) -> dict[str, str]:
@@ -272,13 +264,11 @@ def topics_of(path: Path) -> tuple[Topic, ...]:
             if summary is not None and summary.statistics is not None:
                 counts, schemas = summary.statistics.channel_message_counts, summary.schemas
                 return tuple(
-                    Topic(one.topic, _type(schemas, one), counts.get(one.id, 0)) for one in summary.channels.values()
+                    Topic(one.topic, _type(schemas.get(one.schema_id)), counts.get(one.id, 0))
+                    for one in summary.channels.values()
                 )
             file.seek(0)
-            copy = _Copy(None)
-            for record in _records(file, ignore):
-                copy.take(record)
-            return copy.topics
+            return _topics(Counter((channel.topic, _type(schema)) for schema, channel, _ in _messages(file, ignore)))
     except Exception as error:
         raise _unreadable(path, error) from error
 
@@ -303,95 +293,66 @@ def lighten(
     writer = Writer(out)
     writer.start(profile="ros2", library="suture-skills")
     writer.add_metadata(NOTES, dict(notes))
-    copy = _Copy(writer)
+    counts: Counter[tuple[str, str]] = Counter()
+    numbers: dict[
+        tuple[object, ...], int
+    ] = {}  # in the copy; equal schemas, and equal channels, of two files share one
     for path in paths:
-        copy.start_file()
         try:
             with path.open("rb") as file:
-                for record in _records(file, progress):
-                    copy.take(record)
+                counts.update({(topic.name, topic.type): 0 for topic in topics_of(path)})  # also without messages
+                for schema, channel, message in _messages(file, progress):
+                    kind = _type(schema)
+                    counts[channel.topic, kind] += 1
+                    if kind not in PICTURES:
+                        number = _place(writer, numbers, schema, channel)
+                        writer.add_message(
+                            number, message.log_time, message.data, message.publish_time, message.sequence
+                        )
+        except SkillsError:
+            raise
         except Exception as error:
             raise _unreadable(path, error) from error
     writer.finish()  # type: ignore[no-untyped-call]
-    return copy.topics
+    return _topics(counts)
 
 
-@dataclass
-class _Copy:
-    """Schemas and channels of the files so far, and their numbers in the copy; without a writer it only counts."""
-
-    writer: Writer | None
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
-    _placed: dict[int, int] = field(default_factory=dict)  # channel numbers of the current file, and in the copy
-    _known_schemas: dict[tuple[str, str, bytes], int] = field(default_factory=dict)
-    _known_channels: dict[tuple[object, ...], int] = field(default_factory=dict)
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """The topics of the files, with their numbers of messages."""
-        return tuple(Topic(name, kind, count) for (name, kind), count in sorted(self.counts.items()))
-
-    def start_file(self) -> None:
-        """Forget the schema and channel numbers of the previous file."""
-        self.schemas, self.channels, self._placed = {}, {}, {}
-
-    def take(self, record: McapRecord) -> None:
-        """Process a record: copy a message unless it is of a picture, remember a schema or a channel."""
-        if isinstance(record, Schema):
-            self.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            self.channels[record.id] = record
-            self.counts[record.topic, _type(self.schemas, record)] += 0  # topics without messages are listed too
-        elif isinstance(record, Message):
-            channel = self.channels[record.channel_id]
-            kind = _type(self.schemas, channel)
-            self.counts[channel.topic, kind] += 1
-            if self.writer is not None and kind not in PICTURES:
-                number = self._placed.get(channel.id) or self._place(self.writer, channel)
-                self.writer.add_message(number, record.log_time, record.data, record.publish_time, record.sequence)
-
-    def _place(self, writer: Writer, channel: Channel) -> int:
-        """Return the number of a channel in the copy; equal channels of two files share one."""
-        schema_number = 0
-        if channel.schema_id:
-            schema = self.schemas[channel.schema_id]
-            known = (schema.name, schema.encoding, schema.data)
-            if known not in self._known_schemas:
-                self._known_schemas[known] = writer.register_schema(*known)
-            schema_number = self._known_schemas[known]
-        same = (channel.topic, channel.message_encoding, schema_number, tuple(sorted(channel.metadata.items())))
-        if same not in self._known_channels:
-            number = writer.register_channel(channel.topic, channel.message_encoding, schema_number, channel.metadata)
-            self._known_channels[same] = number
-        self._placed[channel.id] = self._known_channels[same]
-        return self._placed[channel.id]
+def _place(writer: Writer, numbers: dict[tuple[object, ...], int], schema: Schema | None, channel: Channel) -> int:
+    """Return the number of a channel in the copy, where it is registered first if it is not yet."""
+    schema_number = 0
+    if schema is not None:
+        known = (schema.name, schema.encoding, schema.data)
+        schema_number = numbers.get(known) or numbers.setdefault(known, writer.register_schema(*known))
+    same = (channel.topic, channel.message_encoding, schema_number, tuple(sorted(channel.metadata.items())))
+    if same not in numbers:
+        numbers[same] = writer.register_channel(
+            channel.topic, channel.message_encoding, schema_number, channel.metadata
+        )
+    return numbers[same]
 
 
-def _records(file: IO[bytes], progress: Progress) -> Iterator[McapRecord]:
-    """Yield the records of a file, including those in its chunks, and check that the file is complete.
-
-    Records after the end of the data section are checked but not yielded, because they repeat earlier ones.
-    """
-    ended, at, found = False, 0, 0
-    reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_RECORD_BYTES)
-    for record in reader.records:
+def _messages(file: IO[bytes], progress: Progress) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Yield the messages of a file, and check that it is complete."""
+    at, found = 0, 0
+    reader = NonSeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_BYTES)
+    for one in reader.iter_messages(log_time_order=False):
         progress(file.tell() - at)
-        at = file.tell()
-        ended = ended or isinstance(record, DataEnd)
-        if isinstance(record, Statistics) and record.message_count != found:
-            raise UnreadableRecording(f"it declares {record.message_count} messages, but has {found}")
-        for one in breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]:
-            found += isinstance(one, Message)
-            if not ended:  # the summary repeats schemas and channels
-                yield one
-    if not ended:
-        raise UnreadableRecording("its data section has no end")
+        at, found = file.tell(), found + 1
+        yield one
+    progress(file.tell() - at)
+    file.seek(0)
+    summary = make_reader(file).get_summary()
+    declared = None if summary is None or summary.statistics is None else summary.statistics.message_count
+    if declared not in (None, found):
+        raise UnreadableRecording(f"it declares {declared} messages, but has {found}")
 
 
-def _type(schemas: Mapping[int, Schema], channel: Channel) -> str:
-    return schemas[channel.schema_id].name if channel.schema_id else ""
+def _topics(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
+    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+
+def _type(schema: Schema | None) -> str:
+    return "" if schema is None else schema.name
 
 
 def _unreadable(path: Path, error: Exception) -> UnreadableRecording:

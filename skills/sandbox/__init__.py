@@ -1,7 +1,8 @@
 """Function calls in subprocesses under resource limits, which contain the effects of untrusted input.
 
     forked        `ForkServer` calls functions in forks of a small server that has imported everything already, within a
-                  millisecond or two; `call_alone` calls one in a new interpreter; `Turns` shares the forks fairly
+                  millisecond or two; `call_alone` calls one in a new interpreter
+    turns         `Turns` shares the forks fairly among callers
     fork_server   the server process itself
     containment   what these processes cannot reach: files, processes, networks, rights; `system_calls` is its filter
 

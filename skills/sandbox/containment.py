@@ -16,8 +16,8 @@ system offers all of them: containers often have no namespaces, older kernels no
 forks, each in turn and by attempting what it prevents. The layers that held there must be taken by every process after
 it: one that cannot take them ends before it reads anything.
 
-The fork server enters the first five, once (`enter`), and each of its forks the others (`shut`). A fork has the layers
-of the one thread that forked it.
+The fork server enters the first five, once, and each of its forks the others. A fork has the layers of the one thread
+that forked it.
 """
 
 import ctypes
@@ -32,6 +32,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from skills.sandbox import system_calls
 
@@ -278,31 +279,36 @@ def _has_few_system_calls(place: Allowance) -> bool:
     return all(_is_refused(one) for one in attempts)
 
 
-Layer = tuple[Callable[[Allowance], None], Callable[[Allowance], bool]]  # enters it; attempts what it prevents
-_OF_SERVER: dict[str, Layer] = {
-    "own network": (_own_network, _no_network),
-    "own files": (_own_files, _only_own_files),
-    "own user": (_own_user, _useful_user),
-    "no capabilities": (_no_capabilities, _none_left),
-    "no new privileges": (_no_new_privileges, _has_no_new_privileges),
+class Layer(NamedTuple):
+    """A layer of containment.
+
+    Attributes:
+        needs: What it needs of the system.
+        apply: Enters it.
+        holds: Attempts what it prevents, and returns whether that was refused.
+        of_server: Whether the fork server enters it once, and not each fork.
+    """
+
+    needs: str
+    apply: Callable[[Allowance], None]
+    holds: Callable[[Allowance], bool]
+    of_server: bool = False
+
+
+_LAYERS = {  # in the order in which they are entered
+    "own network": Layer(
+        "network and IPC namespaces: CAP_SYS_ADMIN, or user namespaces for everybody", _own_network, _no_network, True
+    ),
+    "own files": Layer("mount namespaces, likewise, and Linux 5.12", _own_files, _only_own_files, True),
+    "own user": Layer("code and temporary files that another user than root can reach", _own_user, _useful_user, True),
+    "no capabilities": Layer("Linux 2.6.26", _no_capabilities, _none_left, True),
+    "no new privileges": Layer("Linux 3.5", _no_new_privileges, _has_no_new_privileges, True),
+    "not dumpable": Layer("Linux 2.4", _not_dumpable, _is_not_dumpable),
+    "file rights": Layer("Landlock: Linux 5.13", _file_rights, _has_file_rights),
+    "signals": Layer("Landlock with scopes: Linux 6.12", _signals, _sends_no_signals),
+    "system calls": Layer("seccomp filters, on x86_64 or aarch64", _system_calls, _has_few_system_calls),
 }
-_OF_FORK: dict[str, Layer] = {
-    "not dumpable": (_not_dumpable, _is_not_dumpable),
-    "file rights": (_file_rights, _has_file_rights),
-    "signals": (_signals, _sends_no_signals),
-    "system calls": (_system_calls, _has_few_system_calls),
-}
-LAYERS = {  # in the order in which they are entered, with what each needs
-    "own network": "network and IPC namespaces: CAP_SYS_ADMIN, or user namespaces for everybody",
-    "own files": "mount namespaces, likewise, and Linux 5.12",
-    "own user": "code and temporary files that another user than root can reach",
-    "no capabilities": "Linux 2.6.26",
-    "no new privileges": "Linux 3.5",
-    "not dumpable": "Linux 2.4",
-    "file rights": "Landlock: Linux 5.13",
-    "signals": "Landlock with scopes: Linux 6.12",
-    "system calls": "seccomp filters, on x86_64 or aarch64",
-}
+LAYERS = {name: layer.needs for name, layer in _LAYERS.items()}
 
 
 def prepare(layers: Iterable[str]) -> None:
@@ -315,26 +321,17 @@ def prepare(layers: Iterable[str]) -> None:
         _own_rights()
 
 
-def enter(place: Allowance, layers: Iterable[str]) -> None:
-    """Enter those of the layers that a fork server enters, after `prepare`; its other threads do not enter all.
+def enter(place: Allowance, layers: Iterable[str], *, of_server: bool) -> None:
+    """Enter those of the layers that a fork server enters, after `prepare`, or those that each fork enters.
+
+    Other threads of this process do not enter all of them.
 
     Raises:
         OSError: The system refuses one of them.
     """
-    for name in _OF_SERVER:
-        if name in layers:
-            _OF_SERVER[name][0](place)
-
-
-def shut(place: Allowance, layers: Iterable[str]) -> None:
-    """Enter those of the layers that a fork enters.
-
-    Raises:
-        OSError: The system refuses one of them.
-    """
-    for name in _OF_FORK:
-        if name in layers:
-            _OF_FORK[name][0](place)
+    for name, layer in _LAYERS.items():
+        if name in layers and layer.of_server == of_server:
+            layer.apply(place)
 
 
 def offered(place: Allowance) -> list[str]:
@@ -354,9 +351,9 @@ def _held_in_a_fork(place: Allowance, wanted: list[str]) -> list[str]:
     pid = os.fork()
     if pid == 0:
         try:
-            if _tried(place, wanted, _OF_SERVER, send):
+            if _tried(place, wanted, send, of_server=True):
                 if os.fork() == 0:  # as later: its parent has the same user, and only the layers of a server
-                    _tried(place, wanted, _OF_FORK, send)
+                    _tried(place, wanted, send, of_server=False)
                 else:
                     os.wait()
         except BaseException:  # noqa: S110 - whatever it was, the layer does not hold
@@ -364,22 +361,22 @@ def _held_in_a_fork(place: Allowance, wanted: list[str]) -> list[str]:
         finally:
             os._exit(0)
     os.close(send)
-    with open(receive, "rb") as told:
-        held = [json.loads(line) for line in told]
+    with open(receive, "rb") as reports:
+        held = [json.loads(line) for line in reports]
     os.waitpid(pid, 0)
     if os.geteuid() == 0:
         os.chown(place.folder, 0, 0)  # the fork gave it away
     return held
 
 
-def _tried(place: Allowance, wanted: list[str], layers: dict[str, Layer], told: int) -> bool:
+def _tried(place: Allowance, wanted: list[str], pipe: int, *, of_server: bool) -> bool:
     """Enter layers, write the names of those that hold to a pipe, and return whether all hold."""
-    for name, (apply, holds) in layers.items():
-        if name in wanted:
-            apply(place)
-            if not holds(place):
+    for name in wanted:
+        if _LAYERS[name].of_server == of_server:
+            _LAYERS[name].apply(place)
+            if not _LAYERS[name].holds(place):
                 return False
-            os.write(told, json.dumps(name).encode() + b"\n")
+            os.write(pipe, json.dumps(name).encode() + b"\n")
     return True
 
 

@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from skills.sandbox import ProcessLimits, confine, perform
-from skills.sandbox.containment import Allowance, enter, offered, prepare, shut
+from skills.sandbox.containment import Allowance, enter, offered, prepare
 
 MAX_REQUEST_BYTES = 16384
 BEGUN, NO_FORK = b"begun", b"no fork"
@@ -85,7 +85,7 @@ def main(folder: str, code: str, layers: str, *modules: str) -> NoReturn:
     gc.freeze()  # the collector would write to pages shared with the forks, and so copy them
     gc.enable()
     inherited = _Inherited(place, held, _held_bytes())
-    enter(place, held)
+    enter(place, held, of_server=True)
     children: dict[int, _Child] = {}
     try:
         with socket.socket(fileno=0) as control, selectors.DefaultSelector() as events:
@@ -223,7 +223,7 @@ def _be_child(
         # The outermost package before, because the folder that contains it can no longer be listed then.
         importlib.import_module(module.partition(".")[0])
         place = Allowance(tempfile.tempdir, inherited.place.code, threads=limits.threads, program=limits.program)
-        shut(place, inherited.layers)
+        enter(place, inherited.layers, of_server=False)
         function = getattr(importlib.import_module(module), name)
         with os.fdopen(0, "rb", closefd=False) as file, os.fdopen(answer, "wb") as out:
             function(file, out, **request["arguments"])

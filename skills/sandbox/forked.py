@@ -1,4 +1,4 @@
-"""Function calls in forks of a server process, shared fairly among callers.
+"""Function calls in forks of a server process.
 
 `ForkServer` calls functions in forks of a server process that has imported their modules already. The server is started
 as a new interpreter (so it has no threads, none of our memory and a minimal environment) and is started again when it
@@ -15,11 +15,6 @@ system offers; later ones must take the same, or end. `layers_held` returns them
 A function reads its input from a file, which is a stranger's or a value written by `skills.packing`, and writes its
 result to another with `packing.write`. That is read as untrusted: only the classes that the caller names are built, and
 their constructors check every number.
-
-`Turns` limits the number of concurrent calls. With N workers one key holds at most N - 1 of them, so that one is free
-for other keys; a single worker is shared in time. Waiting callers are served round-robin by key, and in order of
-arrival within a key. The queue as a whole and the share of each key are bounded: beyond that a request is refused at
-once.
 """
 
 import errno
@@ -32,12 +27,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
-from itertools import count
-from threading import Event, Lock
+from threading import Lock
 from typing import IO, Any, BinaryIO, TypeVar
 
 from skills import packing
@@ -53,71 +46,6 @@ OF_THE_SYSTEM = {errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ESTALE, errno.EMFI
 
 Watch = Callable[[bytes], None]
 Answer = TypeVar("Answer")
-
-
-class Turns:
-    """A fair, bounded queue for `at_once` workers; thread-safe."""
-
-    def __init__(self, at_once: int, *, waiting: int, waiting_of_one: int) -> None:
-        """Create the queue.
-
-        Args:
-            at_once: Number of turns held concurrently.
-            waiting: Maximum number of callers that wait or hold a turn, over all keys.
-            waiting_of_one: The same for one key.
-        """
-        self._at_once = at_once
-        self._of_one = max(1, at_once - 1)
-        self._most, self._most_of_one = waiting, waiting_of_one
-        self._working: Counter[str] = Counter()
-        self._queues: dict[str, deque[Event]] = {}  # only keys with waiting callers
-        self._served: dict[str, int] = {}  # by key, the sequence number of its newest turn
-        self._turns = count(1)
-        self._lock = Lock()
-
-    @property
-    def asked(self) -> int:
-        """The number of callers that wait or hold a turn."""
-        with self._lock:
-            return self._asked()
-
-    @contextmanager
-    def turn(self, key: str) -> Iterator[None]:
-        """Wait for a turn, and hold it for the duration of the block.
-
-        Raises:
-            Busy: Too many callers are waiting already, in total or of this key.
-        """
-        begin = Event()
-        with self._lock:
-            of_key = len(self._queues.get(key, ())) + self._working[key]
-            if self._asked() >= self._most or of_key >= self._most_of_one:
-                raise Busy("Too many recordings are being read just now; try again in a moment.")
-            self._queues.setdefault(key, deque()).append(begin)
-            self._give()
-        begin.wait()
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._working[key] -= 1
-                self._give()
-
-    def _asked(self) -> int:
-        return sum(map(len, self._queues.values())) + self._working.total()
-
-    def _give(self) -> None:
-        """Grant free turns to the next callers, round-robin by key; the caller holds the lock."""
-        while self._working.total() < self._at_once:
-            keys = [key for key in self._queues if self._working[key] < self._of_one]
-            if not keys:
-                return
-            key = min(keys, key=lambda key: self._served.get(key, 0))
-            self._served[key] = next(self._turns)
-            self._working[key] += 1
-            self._queues[key].popleft().set()
-            if not self._queues[key]:
-                del self._queues[key]
 
 
 START_S = 60.0  # timeout of the imports on a busy machine; usually they take 1 s, and forking a millisecond

@@ -14,7 +14,9 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, BinaryIO
+from functools import cached_property
+from itertools import pairwise
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,8 +24,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from skills import packing
 from skills.arrays import Ints
-from skills.errors import SimulationFailed
+from skills.errors import BadInput
 from skills.kinematics import JAW_TIP_MM, quaternion_of
+from skills.planning.handoff import OtherArm
+from skills.planning.motion_laws import PHASES, Poses
 from skills.planning.trajectory import A1, A2, TRANSFER, Trajectory
 from skills.sandbox import ProcessLimits
 from skills.simulation import pictures, simulator
@@ -47,7 +51,6 @@ _NEAR = 4  # passes before and after the present one whose path is drawn: with m
 _TRANSFER_COLOUR: pictures.Colour = (110, 110, 110)
 _INK, _FAINT = (20, 20, 20), (120, 120, 120)
 _ARMS = (("PSM_A", (64, 69, 77)), ("PSM_M", (66, 104, 66)))
-Asked = dict[str, Any]  # named arrays, numbers and texts
 _SAID = {
     TRANSFER: "transfer: to the start of the pass",
     A1: "A1: along the path of the policy",
@@ -61,6 +64,36 @@ class Film:
 
     mp4: bytes
     gif: bytes
+
+    def __post_init__(self) -> None:
+        if self.mp4[4:8] != b"ftyp" or self.gif[:6] != b"GIF89a":
+            raise BadInput("This is no film.")
+
+
+@dataclass(frozen=True, eq=False)
+class FilmRequest:
+    """A trajectory, the height of the pad in mm, and the samples to show, shape (F,)."""
+
+    trajectory: Trajectory
+    pad_top_mm: float
+    samples: Ints
+
+    @cached_property
+    def drawn(self) -> Ints:
+        """The samples through which the tip's path is drawn: at most `_POINTS` of each transfer and each A1."""
+        phase, group = self.trajectory.phase, self.groups
+        parts = np.split(np.arange(len(group)), np.flatnonzero(np.diff(group)) + 1)
+        moving = [part for part in parts if phase[part[0]] != A2]
+        thinned = [part[np.linspace(0, len(part) - 1, min(len(part), _POINTS)).round().astype(int)] for part in moving]
+        return np.concatenate([*thinned, np.empty(0, np.int64)]).astype(np.int64)
+
+    @cached_property
+    def groups(self) -> Ints:
+        """For each sample of the trajectory, three times its pass and its phase."""
+        return self.trajectory.pass_index * len(PHASES) + self.trajectory.phase
+
+
+CLASSES = packing.known(FilmRequest, Trajectory, OtherArm, Poses, Film)
 
 
 # ---- outside the process ---------------------------------------------------------------------------------------
@@ -92,13 +125,7 @@ def shoot(
         simulator.require_pybullet()
     at = frames_of(trajectory) if samples is None else np.asarray(samples, np.int64)
     limits = ProcessLimits(memory_bytes, timeout_s, program=_encoder())
-    answer = simulated(target, _request(trajectory, at, pad_top_mm), limits)
-    mp4, gif = (part if isinstance(part := answer.get(name), bytes) else b"" for name in ("mp4", "gif"))
-    if mp4[4:8] != b"ftyp" or gif[:6] != b"GIF89a":
-        raise SimulationFailed(
-            "The simulator returned no film; request it again, and report it if it happens again.", cause="nonsense"
-        )
-    return Film(mp4, gif)
+    return simulated(target, FilmRequest(trajectory, pad_top_mm, at), Film, CLASSES, limits)
 
 
 def _encoder() -> str:
@@ -116,53 +143,17 @@ def frames_of(trajectory: Trajectory) -> Ints:
     return np.unique(np.concatenate([evenly, trajectory.last_samples]))
 
 
-def _request(trajectory: Trajectory, at: Ints, pad_top_mm: float) -> Asked:
-    place, rotation = needle_poses(trajectory, at)
-    way = _way(trajectory)
-    asked: Asked = {
-        "instrument": trajectory.instrument,
-        "rate_hz": trajectory.rate_hz,
-        "pad_top_mm": pad_top_mm,
-        "extent_mm": np.stack([trajectory.tip_mm.min(axis=0), trajectory.tip_mm.max(axis=0)]),
-        "samples": len(trajectory),
-        "at": at,
-        "stamps_s": trajectory.stamps_s[at] - trajectory.stamps_s[0],
-        "joints": trajectory.joints[at],
-        "pass_index": trajectory.pass_index[at],
-        "phase": trajectory.phase[at],
-        "pass_begins": np.append(0, trajectory.last_samples[:-1] + 1),
-        "needle_mm": place,
-        "needle_xyzw": quaternion_of(rotation),
-        "way": way,
-        "way_mm": trajectory.tip_mm[way],
-        "way_pass": trajectory.pass_index[way],
-        "way_phase": trajectory.phase[way],
-    }
-    if (m := trajectory.psm_m) is not None:
-        asked |= {"m_base_mm": m.base_mm, "m_base_xyzw": m.base_xyzw, "m_instrument": m.instrument}
-        asked["m_joints"] = m.joints[at]
-    return asked
-
-
-def _way(trajectory: Trajectory) -> Ints:
-    """Choose the samples through which the tip's path is drawn: at most `_POINTS` of each transfer and each A1."""
-    group = trajectory.pass_index * 3 + trajectory.phase
-    parts = np.split(np.arange(len(trajectory)), np.flatnonzero(np.diff(group)) + 1)
-    moving = [part for part in parts if trajectory.phase[part[0]] != A2]
-    thinned = [part[np.linspace(0, len(part) - 1, min(len(part), _POINTS)).round().astype(int)] for part in moving]
-    return np.concatenate([*thinned, np.empty(0, np.int64)]).astype(np.int64)
-
-
 # ---- inside the process ----------------------------------------------------------------------------------------
 
 
 def film(given: BinaryIO, answer: BinaryIO) -> None:
     """Make the film that `shoot` requests."""
     os.nice(_NICENESS)
-    asked: Asked = packing.read(given, {})
-    with simulator.opened(asked["instrument"], asked["rate_hz"]) as set_up:
-        mp4, gif = encode(_frames(set_up, asked))
-    packing.write(answer, {"mp4": mp4, "gif": gif}, {})
+    asked = packing.read(given, CLASSES)
+    assert isinstance(asked, FilmRequest)
+    with simulator.opened(asked.trajectory.instrument, asked.trajectory.rate_hz) as scene:
+        made = Film(*encode(_frames(scene, asked)))
+    packing.write(answer, made, CLASSES)
 
 
 def encode(frames: Iterable[bytes]) -> tuple[bytes, bytes]:
@@ -186,62 +177,63 @@ def encode(frames: Iterable[bytes]) -> tuple[bytes, bytes]:
         return mp4.read(), gif.read()
 
 
-def _frames(set_up: simulator.Simulator, asked: Asked) -> Iterator[bytes]:
+def _frames(scene: simulator.Simulator, asked: FilmRequest) -> Iterator[bytes]:
     """Pose the scene for one frame after the other; the last one is repeated."""
-    set_up.place_pad(asked["extent_mm"], asked["pad_top_mm"])
-    if "m_joints" in asked:
-        set_up.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], asked["m_instrument"])
+    motion = asked.trajectory
+    scene.set_up(motion, asked.pad_top_mm)
     camera = _camera(asked)
+    place_mm, rotation = needle_poses(motion, asked.samples)
+    turns = quaternion_of(rotation)
     frame = b""
-    for k in range(len(asked["at"])):
-        set_up.pose(asked["joints"][k])
-        if set_up.psm_m is not None:
-            set_up.pose(asked["m_joints"][k], set_up.psm_m)
-        taken = set_up.photograph(camera, (asked["needle_mm"][k], asked["needle_xyzw"][k]))
-        sheet = pictures.Sheet(taken, camera)
-        _draw_way(sheet, asked, k)
-        frame = _framed(sheet.finished(), asked, k).tobytes()
+    for k, sample in enumerate(asked.samples.tolist()):
+        scene.pose(motion.joints[sample])
+        if scene.psm_m is not None and motion.psm_m is not None:
+            scene.pose(motion.psm_m.joints[sample], scene.psm_m)
+        sheet = pictures.Sheet(scene.photograph(camera, (place_mm[k], turns[k])), camera)
+        _draw_path(sheet, asked, sample)
+        frame = _framed(sheet.finished(), motion, sample).tobytes()
         yield frame
     yield from [frame] * (HELD_FRAMES - 1)
 
 
-def _camera(asked: Asked) -> pictures.Camera:
+def _camera(asked: FilmRequest) -> pictures.Camera:
     """Return a camera on the side opposite to PSM_M that also shows the finger tips, which are below the path."""
-    way = asked["way_mm"]
-    facing = pictures.facing(np.concatenate([way, way - [0.0, 0.0, JAW_TIP_MM]]) * simulator.MM)
-    if "m_joints" in asked and asked["m_base_mm"][0] > way[:, 0].mean():
+    path_mm, m = asked.trajectory.tip_mm[asked.drawn], asked.trajectory.psm_m
+    facing = pictures.facing(np.concatenate([path_mm, path_mm - [0.0, 0.0, JAW_TIP_MM]]) * simulator.MM)
+    if m is not None and m.base_mm[0] > path_mm[:, 0].mean():
         facing = replace(facing, yaw_deg=-facing.yaw_deg)
     height = HEIGHT - _HEAD - _FOOT
     return replace(facing, width=int(WIDTH * _SCALE), height=int(height * _SCALE), scale=_SCALE)
 
 
-def _draw_way(sheet: pictures.Sheet, asked: Asked, k: int) -> None:
-    now, present = int(asked["at"][k]), asked["pass_index"][k]
-    group = asked["way_pass"] * 3 + asked["way_phase"]
-    for one in np.unique(group[np.abs(asked["way_pass"] - present) <= _NEAR]):
-        mine = group == one
-        way, place, number = asked["way"][mine], asked["way_mm"][mine] * simulator.MM, int(one) // 3
-        along = int(one) % 3 == A1
+def _draw_path(sheet: pictures.Sheet, asked: FilmRequest, now: int) -> None:
+    motion, drawn = asked.trajectory, asked.drawn
+    near = np.abs(motion.pass_index[drawn] - motion.pass_index[now]) <= _NEAR
+    for group in np.unique(asked.groups[drawn[near]]).tolist():
+        samples = drawn[asked.groups[drawn] == group]
+        number, phase = divmod(group, len(PHASES))
+        place, along = motion.tip_mm[samples] * simulator.MM, phase == A1
         colour = pictures.colour_of(number) if along else _TRANSFER_COLOUR
-        done = int(np.searchsorted(way, now, side="right"))
+        done = int(np.searchsorted(samples, now, side="right"))
         sheet.line(place[max(0, done - 1) :], colour, 1.2, strength=0.45)
         sheet.line(place[:done], colour, 2.4 if along else 1.2, strength=0.95)
         if along:
             sheet.label(place[-1], pictures.GOAL_COLOUR, str(number), 7.0)
 
 
-def _framed(view: Image.Image, asked: Asked, k: int) -> Image.Image:
+def _framed(view: Image.Image, motion: Trajectory, now: int) -> Image.Image:
     """Return the frame: the view, with a title and time line above it and a legend below."""
     frame = Image.new("RGB", (WIDTH, HEIGHT), pictures.WHITE)
     frame.paste(view, (0, _HEAD))
     pen = ImageDraw.Draw(frame)
     large, small = ImageFont.load_default(size=15), ImageFont.load_default(size=11)
-    number, phase = int(asked["pass_index"][k]), int(asked["phase"][k])
+    number, phase = int(motion.pass_index[now]), int(motion.phase[now])
+    seconds = motion.stamps_s[now] - motion.stamps_s[0]
     pen.text((8, _HEAD // 2 - 2), f"Pass {number}   {_SAID[phase]}", fill=_INK, font=large, anchor="lm")
-    pen.text((WIDTH - 8, _HEAD // 2 - 2), f"{asked['stamps_s'][k]:.1f} s", fill=_INK, font=large, anchor="rm")
-    _draw_progress(pen, asked, int(asked["at"][k]))
+    pen.text((WIDTH - 8, _HEAD // 2 - 2), f"{seconds:.1f} s", fill=_INK, font=large, anchor="rm")
+    _draw_progress(pen, motion, now)
     x, y = 8.0, HEIGHT - _FOOT / 2
-    for name, colour in _ARMS[: 2 if "m_joints" in asked else 1]:
+    for name, colour in _ARMS[: 1 if motion.psm_m is None else 2]:
         pen.rectangle((x, y - 4, x + 8, y + 4), fill=colour)
         pen.text((x + 13, y), name, fill=_INK, font=small, anchor="lm")
         x += 26 + pen.textlength(name, font=small)
@@ -249,11 +241,11 @@ def _framed(view: Image.Image, asked: Asked, k: int) -> Image.Image:
     return frame
 
 
-def _draw_progress(pen: ImageDraw.ImageDraw, asked: Asked, now: int) -> None:
+def _draw_progress(pen: ImageDraw.ImageDraw, motion: Trajectory, now: int) -> None:
     """Draw a bar above the view, one part for each pass, filled up to the present sample."""
-    total, top = asked["samples"], _HEAD - 4
-    begins = asked["pass_begins"].tolist()
-    for number, (begin, end) in enumerate(zip(begins, [*begins[1:], total], strict=True)):
+    total, top = len(motion), _HEAD - 4
+    ends = (motion.last_samples + 1).tolist()
+    for number, (begin, end) in enumerate(pairwise([0, *ends])):
         left, right = WIDTH * begin / total, WIDTH * end / total - 1
         colour = pictures.colour_of(number)
         pale: pictures.Colour = tuple(round(255 - (255 - part) * 0.3) for part in colour)  # type: ignore[assignment]

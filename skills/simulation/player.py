@@ -1,13 +1,13 @@
 """The player of trajectories in the simulator: metres and PyBullet in its process, millimetres and values in ours."""
 
 import re
-from collections.abc import Callable
+from dataclasses import fields, replace
 from math import isfinite
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skills import packing
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput, SimulationFailed, Unanswered
 from skills.kinematics import JAW_TIP_MM, matrix_of
@@ -16,14 +16,16 @@ from skills.planning.trajectory import Trajectory
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
 from skills.simulation import simulator
+from skills.simulation.simulator import CLASSES, PlayRequest
 from skills.verification.clearance import FINGER_REACH_MM, openings, psm_m_poses
-from skills.verification.playback import Playback, link_pairs
+from skills.verification.playback import Playback
 
 SIMULATOR = "skills.simulation.simulator:simulate"
 PAD_BELOW_MM = 5.0  # ours: height of the finger tips above a pad whose height is not given
 CLEARANCE_EVERY = 4  # samples: 0.33 mm of the tip's path at 20 mm/s and 240 Hz, for which the bounds on distances allow
-Plain = TypeVar("Plain", bytes, str, float, dict[Any, Any])
+Answer = TypeVar("Answer")
 _PNG = b"\x89PNG\r\n\x1a\n"
+_FILE, _DIGEST = re.compile(r"\w+\.urdf"), re.compile("[0-9a-f]{64}")
 _ADVICE = {
     "hung": "play fewer passes",
     "crashed": "play it again, and report it if it happens again",
@@ -73,9 +75,39 @@ def play(
         raise BadInput("The step between samples with distances must be 1 or more.", given=clearance_every)
     if target == SIMULATOR:
         simulator.require_pybullet()
-    asked = request(trajectory, pad, clearance_every)
-    answer = simulated(target, asked, ProcessLimits(memory_bytes, timeout_s))
-    return _playback(answer, trajectory, pad)
+    limits = ProcessLimits(memory_bytes, timeout_s)
+    playback = simulated(target, request(trajectory, pad, clearance_every), Playback, CLASSES, limits)
+    try:
+        mine = replace(playback, trajectory=trajectory)  # checks all shapes again
+    except BadInput as error:
+        raise _nonsense(str(error)) from error
+    _check(mine)
+    return mine
+
+
+def _check(playback: Playback) -> None:
+    """Refuse a playback with a number that is not finite, or with texts and files that no simulator has.
+
+    Raises:
+        SimulationFailed: It has.
+    """
+    for field in fields(playback):
+        value = getattr(playback, field.name)
+        if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+            raise _nonsense(f"{field.name} has numbers that are not finite.")
+    named = all(isinstance(text, str) for pair in playback.files.items() for text in pair) and all(
+        _FILE.fullmatch(name) and _DIGEST.fullmatch(digest) for name, digest in playback.files.items()
+    )
+    pictured = isinstance(playback.picture_png, bytes) and playback.picture_png.startswith(_PNG)
+    timed = isinstance(playback.seconds_per_step, float) and isfinite(playback.seconds_per_step)
+    engine = isinstance(playback.engine, str) and 0 < len(playback.engine) <= 100
+    both = (playback.psm_m_tip_mm is None) == (playback.trajectory.psm_m is None)
+    if not (named and pictured and timed and engine and both):
+        raise _nonsense("the picture, the engine, its files, the time of a step or the arms.")
+
+
+def _nonsense(why: str) -> SimulationFailed:
+    return SimulationFailed(f"The simulator returned invalid data; play it again: {why}", cause="nonsense")
 
 
 def default_pad_top(trajectory: Trajectory) -> float:
@@ -98,14 +130,18 @@ def looks(trajectory: Trajectory, every: int) -> Ints:
     return np.unique(np.concatenate([np.arange(0, count, every), ends, ends + 1, [count - 1]])).astype(np.int64)
 
 
-def simulated(target: str, request: dict[str, Any], limits: ProcessLimits) -> dict[str, Any]:
-    """Send named arrays, numbers and texts to a simulator in a new process and return its answer.
+def simulated(
+    target: str, request: object, returns: type[Answer], classes: packing.Known, limits: ProcessLimits
+) -> Answer:
+    """Send a request to a simulator in a new process and return its answer.
 
     Each call starts a new interpreter, because loading PyBullet takes only a small part of the time.
 
     Args:
         target: The simulator, as `module:function`.
         request: Its input.
+        returns: The class of its answer.
+        classes: The classes that may occur in the request and in the answer, by name.
         limits: Limits of its process.
 
     Raises:
@@ -113,104 +149,11 @@ def simulated(target: str, request: dict[str, Any], limits: ProcessLimits) -> di
             `numbers["cause"]` has the cause, and the end of its output is a note of the error.
     """
     try:
-        return call_alone(target, request, returns=(dict,), classes={}, limits=limits)
+        return call_alone(target, request, returns=(returns,), classes=classes, limits=limits)
     except Unanswered as error:
         raise error.translated(SimulationFailed, "The simulator", _ADVICE) from error.__cause__
 
 
-def request(trajectory: Trajectory, pad_top_mm: float, every: int = CLEARANCE_EVERY) -> dict[str, Any]:
-    """Return the request for the simulator: named arrays, numbers and texts."""
-    asked = {
-        "tip_mm": trajectory.tip_mm,
-        "rotation_xyzw": trajectory.rotation_xyzw,
-        "joints": trajectory.joints,
-        "pass_index": trajectory.pass_index,
-        "phase": trajectory.phase,
-        "rate_hz": trajectory.rate_hz,
-        "instrument": trajectory.instrument,
-        "pad_top_mm": pad_top_mm,
-        "looks": looks(trajectory, every),
-    }
-    if (m := trajectory.psm_m) is not None:
-        asked |= {
-            "m_base_mm": m.base_mm,
-            "m_base_xyzw": m.base_xyzw,
-            "m_joints": m.joints,
-            "m_instrument": m.instrument,
-        }
-    return asked
-
-
-# ---- the answer ------------------------------------------------------------------------------------------------
-
-
-def _playback(answer: dict[str, Any], trajectory: Trajectory, pad_top_mm: float) -> Playback:
-    """Check every number in the answer, because none is trusted, and return them as a playback."""
-    count, with_m = len(trajectory), trajectory.psm_m is not None
-    looked_at = array_from(answer, "looked_at", np.int64, (None,))
-    seen = len(looked_at)
-    low, high = trajectory.tip_mm[:, :2].min(axis=0), trajectory.tip_mm[:, :2].max(axis=0)
-    try:
-        return Playback(
-            trajectory=trajectory,
-            tip_mm=array_from(answer, "tip_mm", np.float64, (count, 3)),
-            rotation_xyzw=array_from(answer, "rotation_xyzw", np.float64, (count, 4)),
-            joints=array_from(answer, "joints", np.float64, (count, 6)),
-            tracking_mm=array_from(answer, "tracking_mm", np.float64, (count,)),
-            efforts=array_from(answer, "efforts", np.float64, (count, 6)),
-            contact_n=array_from(answer, "contact_n", np.float64, (count,)),
-            looked_at=looked_at,
-            clearances_mm=array_from(answer, "clearances_mm", np.float64, (seen, len(link_pairs(with_m)))),
-            shaft_off_mm=array_from(answer, "shaft_off_mm", np.float64, (seen,)),
-            psm_m_tip_mm=array_from(answer, "psm_m_tip_mm", np.float64, (seen, 3)) if with_m else None,
-            pad_mm=np.append((low + high) / 2, pad_top_mm),
-            picture_png=_plain(answer, "picture_png", bytes, lambda picture: picture.startswith(_PNG)),
-            engine=_plain(answer, "engine", str, lambda name: 0 < len(name) <= 100),
-            files=_plain(answer, "files", dict, _are_digests),
-            seconds_per_step=_plain(answer, "seconds_per_step", float, isfinite),
-        )
-    except BadInput:
-        raise _nonsense("looked_at") from None
-
-
-def array_from(answer: dict[str, Any], name: str, dtype: Any, shape: tuple[int | None, ...]) -> NDArray[Any]:
-    """Return an array of a simulator's answer.
-
-    Args:
-        answer: The answer, which is untrusted.
-        name: The array's name.
-        dtype: Its type.
-        shape: Its shape; None: any length.
-
-    Raises:
-        SimulationFailed: It is missing, has another type or shape, or a number that is not finite.
-    """
-    array = answer.get(name)
-    if not isinstance(array, np.ndarray) or array.dtype != dtype or array.ndim != len(shape):
-        raise _nonsense(name)
-    if any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
-        raise _nonsense(name)
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise _nonsense(name)
-    return array
-
-
-def _plain(answer: dict[str, Any], name: str, kind: type[Plain], check: Callable[[Plain], bool]) -> Plain:
-    value = answer.get(name)
-    if not isinstance(value, kind) or not check(value):
-        raise _nonsense(name)
-    return value
-
-
-def _are_digests(files: dict[Any, Any]) -> bool:
-    """Return whether these are names of URDF files with a SHA-256 each."""
-    texts = all(isinstance(text, str) for pair in files.items() for text in pair)
-    return texts and all(re.fullmatch(r"\w+\.urdf", n) and re.fullmatch("[0-9a-f]{64}", d) for n, d in files.items())
-
-
-def _nonsense(name: str) -> SimulationFailed:
-    return SimulationFailed(
-        f"The simulator returned invalid data in {name}; play it again, and report it if it happens again.",
-        cause="nonsense",
-        quantity=name,
-    )
+def request(trajectory: Trajectory, pad_top_mm: float, every: int = CLEARANCE_EVERY) -> PlayRequest:
+    """Return the request for the simulator."""
+    return PlayRequest(trajectory, pad_top_mm, looks(trajectory, every))

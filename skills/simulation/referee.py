@@ -31,7 +31,7 @@ this is ours.
 
 import importlib.util
 import os
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from math import isfinite, pi, sqrt
 from typing import Any, BinaryIO
@@ -39,15 +39,15 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from skills import packing
-from skills.arrays import Flags, Floats, Ints
+from skills.arrays import Flags, Floats, Ints, frozen
 from skills.errors import BadInput, BadSettings, SimulationFailed
 from skills.kinematics import JAW_TIP_MM, matrix_of, quaternion_of
 from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, NEEDLE_RADIUS_MM, OPEN_RAD
-from skills.planning.motion_laws import PEAK
-from skills.planning.trajectory import A2, Trajectory
+from skills.planning.motion_laws import A2, PEAK
+from skills.planning.trajectory import Trajectory
 from skills.quaternions import vector_of
 from skills.sandbox import ProcessLimits
-from skills.simulation.player import array_from, simulated
+from skills.simulation.player import simulated
 from skills.verification.arm_errors import ArmErrors
 from skills.verification.clearance import (
     ASIDE_MM,
@@ -174,6 +174,53 @@ class Refereed:
         return not self.closed_form.probability <= self.held.upper
 
 
+@dataclass(frozen=True, eq=False)
+class TrialsRequest:
+    """The trials to make: N worlds at W samples, with the physics of each run and the number of worlds to try in it.
+
+    Attributes:
+        stamps_s: Times of the samples, from the first one, shape (W,).
+        tip_mm: The hinges of both arms' jaws in PSM_A's base frame, shape (N, 2, W, 3).
+        jaw: The rotations of both jaws, shape (N, 2, W, 3, 3).
+        needle_mm: The needle at the first sample, shape (N, 3).
+        needle: Its rotation, shape (N, 3, 3).
+        jaws_s: Times of the jaws' angles, from where both arms stand, shape (J,).
+        jaws_rad: The planned angles of both jaws, shape (2, J).
+        back_s: The time in which PSM_M goes back.
+        physics: Of each run.
+        counts: Of each run, the number of worlds, the first ones.
+    """
+
+    stamps_s: Floats
+    tip_mm: Floats
+    jaw: Floats
+    needle_mm: Floats
+    needle: Floats
+    jaws_s: Floats
+    jaws_rad: Floats
+    back_s: float
+    physics: tuple[Physics, ...]
+    counts: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """How trials ended, as 0 (held) or 1 + index in `LOST`; slip, turn and angle to the hinge; and the engine."""
+
+    ended: Ints
+    motion: Floats
+    engine: str
+
+    def __post_init__(self) -> None:
+        frozen(self.motion, np.float64, (len(frozen(self.ended, np.int64, (None,), "ended")), 3), "motion")
+        known = ((self.ended >= 0) & (self.ended <= len(LOST))).all()
+        if not (known and isinstance(self.engine, str) and 0 < len(self.engine) <= 100):
+            raise BadInput("These are no outcomes of trials.")
+
+
+CLASSES = packing.known(TrialsRequest, Physics, Outcomes)
+
+
 # ---- outside the process ---------------------------------------------------------------------------------------
 
 
@@ -235,15 +282,13 @@ def referee(
     displaced = drawn.under(errors, trajectory.stamps_s[watched])
     says = _closed_form(trajectory, number, drawn, displaced, conditions)
     others = [(quantity, factor) for quantity in QUANTITIES for factor in FACTORS if varied]
-    request = _worlds(trajectory, watched, drawn, displaced) | _strokes(trajectory, number, int(watched[-1]))
-    request["physics"] = np.array([astuple(plain), *(astuple(plain.times(*one)) for one in others)])
-    request["trials"] = np.array([trials, *(varied for _ in others)], np.int64)
-    total = int(request["trials"].sum())
-    answer = simulated(target, request, ProcessLimits(memory_bytes, 60.0 + _TRIAL_S * total))
-    ended = array_from(answer, "ended", np.int64, (total,))
-    motion = array_from(answer, "motion", np.float64, (total, 3))
-    engine = answer.get("engine")
-    if not (isinstance(engine, str) and 0 < len(engine) <= 100 and ((ended >= 0) & (ended <= len(LOST))).all()):
+    counts = (trials, *(varied for _ in others))
+    runs = (plain, *(plain.times(*one) for one in others))
+    request = _request(trajectory, number, watched, drawn, displaced, runs, counts)
+    limits = ProcessLimits(memory_bytes, 60.0 + _TRIAL_S * sum(counts))
+    outcomes = simulated(target, request, Outcomes, CLASSES, limits)
+    ended, motion = outcomes.ended, outcomes.motion
+    if len(ended) != sum(counts):
         raise SimulationFailed("The referee returned invalid data; run it again.", cause="nonsense")
     held, again = ended[:trials] == 0, (ended[trials:] == 0).reshape(len(others), varied)
     slipped, turned, askew = motion[:trials].T
@@ -267,7 +312,7 @@ def referee(
         ),
         physics=plain,
         errors=errors,
-        engine=engine,
+        engine=outcomes.engine,
     )
 
 
@@ -291,25 +336,6 @@ def _watched(trajectory: Trajectory, number: int) -> Ints:
     return samples[min(begin, stand) : stand + 1]
 
 
-def _strokes(trajectory: Trajectory, number: int, stand: int) -> dict[str, Floats]:
-    """Return the planned angles of both jaws from where both arms stand, (2, J), their times, and that of the way back.
-
-    PSM_A holds the needle with all its grip until its jaw is planned to move.
-    """
-    psm_m = trajectory.psm_m
-    assert psm_m is not None
-    if trajectory.jaw_rad is None or psm_m.jaw_rad is None:
-        raise BadInput("A motion without angles of both jaws hands nothing over; plan it again.", pass_index=number)
-    at = slice(stand, int(trajectory.last_samples[number]) + 1)
-    mine, theirs = trajectory.jaw_rad[at], psm_m.jaw_rad[at]
-    holds = np.logical_and.accumulate(mine == mine[0])
-    return {
-        "jaws_s": trajectory.stamps_s[at] - trajectory.stamps_s[stand],
-        "jaws_rad": np.stack([np.where(holds, JAW_CLOSED_RAD, mine), theirs]),
-        "back_s": np.array([PEAK * _BACK_MM / trajectory.speed_mm_s]),
-    }
-
-
 def _closed_form(
     trajectory: Trajectory, number: int, drawn: Drawn, displaced: Displaced, conditions: DoubtSettings
 ) -> Flags:
@@ -320,10 +346,27 @@ def _closed_form(
     return np.asarray(np.logical_and(*caught_by(arms, drawn.shift_mm, displaced, drawn.turned, conditions)))
 
 
-def _worlds(trajectory: Trajectory, watched: Ints, drawn: Drawn, displaced: Displaced) -> dict[str, Any]:
-    """Return the poses of both hinges, (N, 2, W, ...), and of the needle, (N, ...), in PSM_A's base frame."""
+def _request(
+    trajectory: Trajectory,
+    number: int,
+    watched: Ints,
+    drawn: Drawn,
+    displaced: Displaced,
+    physics: tuple[Physics, ...],
+    counts: tuple[int, ...],
+) -> TrialsRequest:
+    """Return the request for the trials of a pass, with poses in PSM_A's base frame.
+
+    PSM_A holds the needle with all its grip until its jaw is planned to move.
+    """
     psm_m = trajectory.psm_m
     assert psm_m is not None
+    if trajectory.jaw_rad is None or psm_m.jaw_rad is None:
+        raise BadInput("A motion without angles of both jaws hands nothing over; plan it again.", pass_index=number)
+    stand = int(watched[-1])
+    jaws = slice(stand, int(trajectory.last_samples[number]) + 1)
+    mine, theirs = trajectory.jaw_rad[jaws], psm_m.jaw_rad[jaws]
+    holds = np.logical_and.accumulate(mine == mine[0])
     jaw_a = matrix_of(trajectory.rotation_xyzw[watched])
     hinge_m, jaw_m = psm_m_poses(trajectory, watched)
     _, needle = needle_poses(trajectory, watched[:1])
@@ -335,13 +378,18 @@ def _worlds(trajectory: Trajectory, watched: Ints, drawn: Drawn, displaced: Disp
     turns_a = turn_a[:, None] @ jaw_a
     # The needle's turn is drawn where it is handed over, and stays the same within PSM_A's jaws.
     within = jaw_a[-1].T @ drawn.turned @ jaw_a[-1]
-    return {
-        "stamps_s": trajectory.stamps_s[watched] - trajectory.stamps_s[watched[0]],
-        "tip_mm": np.stack([tip_a, tip_m], axis=1),
-        "jaw": np.stack([turns_a, (base_turn @ turn_m)[:, None] @ jaw_m], axis=1),
-        "needle_mm": tip_a[:, 0] + HELD_MM * turns_a[:, 0, :, 2],
-        "needle": turns_a[:, 0] @ within @ jaw_a[0].T @ needle[0],
-    }
+    return TrialsRequest(
+        stamps_s=trajectory.stamps_s[watched] - trajectory.stamps_s[watched[0]],
+        tip_mm=np.stack([tip_a, tip_m], axis=1),
+        jaw=np.stack([turns_a, (base_turn @ turn_m)[:, None] @ jaw_m], axis=1),
+        needle_mm=tip_a[:, 0] + HELD_MM * turns_a[:, 0, :, 2],
+        needle=turns_a[:, 0] @ within @ jaw_a[0].T @ needle[0],
+        jaws_s=trajectory.stamps_s[jaws] - trajectory.stamps_s[stand],
+        jaws_rad=np.stack([np.where(holds, JAW_CLOSED_RAD, mine), theirs]),
+        back_s=PEAK * _BACK_MM / trajectory.speed_mm_s,
+        physics=physics,
+        counts=counts,
+    )
 
 
 # ---- inside the process: mm, kg, s, mN ---------------------------------------------------------------------------
@@ -365,21 +413,18 @@ def trials(given: BinaryIO, answer: BinaryIO) -> None:
     os.environ["MUJOCO_GL"] = "disable"  # else the import starts a program that looks for a display, and is stopped
     import mujoco
 
-    asked: dict[str, Any] = packing.read(given, {})
+    asked = packing.read(given, CLASSES)
+    assert isinstance(asked, TrialsRequest)
     ended: list[int] = []
     motion: list[tuple[float, float, float]] = []
-    for numbers, count in zip(asked["physics"].tolist(), asked["trials"].tolist(), strict=True):
-        physics = Physics(*numbers)
+    for physics, count in zip(asked.physics, asked.counts, strict=True):
         model = mujoco.MjModel.from_xml_string(_scene(physics))
-        for k in range(count):
-            world = {name: asked[name][k] for name in ("tip_mm", "jaw", "needle_mm", "needle")}
-            shared = {name: asked[name] for name in ("stamps_s", "jaws_s", "jaws_rad")}
-            trial = _Trial(mujoco, model, back_s=float(asked["back_s"][0]), **shared, **world)
-            how, moved = trial.run(physics.step_s)
+        for world in range(count):
+            how, moved = _Trial(mujoco, model, asked, world).run(physics.step_s)
             ended.append(how)
             motion.append(moved)
-    found = {"ended": np.array(ended, np.int64), "motion": np.array(motion, np.float64)}
-    packing.write(answer, found | {"engine": f"MuJoCo {mujoco.__version__}"}, {})
+    found = Outcomes(np.array(ended, np.int64), np.array(motion, np.float64), f"MuJoCo {mujoco.__version__}")
+    packing.write(answer, found, CLASSES)
 
 
 def _scene(physics: Physics) -> str:
@@ -458,24 +503,14 @@ def _text(numbers: Floats) -> str:
 
 
 class _Trial:
-    """One trial in a model; the poses are those of one world of `_worlds`."""
+    """One trial in a model, of one world."""
 
-    def __init__(
-        self,
-        mujoco: Any,
-        model: Any,
-        stamps_s: Floats,
-        jaws_s: Floats,
-        jaws_rad: Floats,
-        back_s: float,
-        tip_mm: Floats,
-        jaw: Floats,
-        needle_mm: Floats,
-        needle: Floats,
-    ) -> None:
+    def __init__(self, mujoco: Any, model: Any, asked: TrialsRequest, world: int) -> None:
         self.mujoco, self.model, self.data = mujoco, model, mujoco.MjData(model)
-        self.stamps_s, self.tip_mm = stamps_s, tip_mm
-        self.jaws_s, self.jaws_rad, self.back_s = jaws_s, jaws_rad, back_s
+        self.stamps_s, self.tip_mm = asked.stamps_s, asked.tip_mm[world]
+        self.jaws_s, self.jaws_rad, self.back_s = asked.jaws_s, asked.jaws_rad, asked.back_s
+        tip_mm, jaw, needle_mm, needle = self.tip_mm, asked.jaw[world], asked.needle_mm[world], asked.needle[world]
+        jaws_s, jaws_rad = self.jaws_s, self.jaws_rad
         self.closed_s = float(jaws_s[np.argmin(jaws_rad[1])])  # then PSM_M's jaw has closed
         self.last = jaw[:, -1]  # the rotation at the hand-off, from which all others are counted
         self.turn = [vector_of(quaternion_of(last.T @ one)) for last, one in zip(self.last, jaw, strict=True)]

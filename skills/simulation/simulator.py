@@ -27,7 +27,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,11 +36,12 @@ from skills import packing
 from skills.arrays import Floats, Ints
 from skills.errors import SimulationFailed
 from skills.kinematics import INSERTION, JOINTS, InstrumentConstants, instrument_of, matrix_of
-from skills.planning.handoff import HELD_MM, HOLDING_RAD, OPEN_RAD
-from skills.planning.trajectory import A1, PSM_A, PSM_M
+from skills.planning.handoff import HELD_MM, HOLDING_RAD, OPEN_RAD, OtherArm
+from skills.planning.motion_laws import A1, Poses
+from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
 from skills.simulation import pictures
 from skills.verification.clearance import Bounds
-from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, link_pairs, pad_scale
+from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, Playback, link_pairs, pad_scale
 
 MM = 1e-3
 PLACE, TURN = 4, 5  # indices of the frame in a link's state; 0 and 1 would be its centre of mass
@@ -50,7 +51,39 @@ FINGER_EFFORT = 0.16  # Nm
 URDF_CENTRE_MM, URDF_WRIST_MM = 431.8, 15.6  # remote centre and wrist offset of `urdf/psm.urdf`
 PSM_M_COLOUR = (0.35, 0.55, 0.35, 1.0)
 LOOK_CLOSER_MM = 2.0  # ours: twice the gates' distances; nearer than this, every sample is measured
-Asked = dict[str, Any]  # named arrays, numbers and texts
+
+
+@dataclass(frozen=True, eq=False)
+class PlayRequest:
+    """A trajectory, the height of the pad in mm, and the samples at which distances are measured first."""
+
+    trajectory: Trajectory
+    pad_top_mm: float
+    looks: Ints
+
+
+class KinematicPass(NamedTuple):
+    """The measurements of the kinematic pass, with the names that they have in a `Playback`."""
+
+    tip_mm: Floats
+    rotation_xyzw: Floats
+    joints: Floats
+    looked_at: Ints
+    clearances_mm: Floats
+    shaft_off_mm: Floats
+    psm_m_tip_mm: Floats | None
+
+
+class ServoPass(NamedTuple):
+    """The measurements of the servo pass, likewise."""
+
+    tracking_mm: Floats
+    efforts: Floats
+    contact_n: Floats
+    seconds_per_step: float
+
+
+CLASSES = packing.known(PlayRequest, Trajectory, OtherArm, Poses, Playback)
 
 
 def require_pybullet() -> None:
@@ -113,6 +146,12 @@ class Simulator:
         self._position_gains, self._velocity_gains = [POSITION_GAIN] * 8, [VELOCITY_GAIN] * 8
 
     # -- contents --
+
+    def set_up(self, trajectory: Trajectory, pad_top_mm: float) -> None:
+        """Place the pad under a trajectory, and PSM_M if it has one."""
+        self.place_pad(trajectory.tip_mm, pad_top_mm)
+        if (m := trajectory.psm_m) is not None:
+            self.place_psm_m(m.base_mm, m.base_xyzw, m.instrument)
 
     def place_pad(self, tip_mm: Floats, top_mm: float) -> None:
         """Lay the pad, large enough, under the middle of the path, with its wound along the path's longer side."""
@@ -326,46 +365,50 @@ def in_metres(joints: Floats) -> Floats:
 
 def simulate(given: BinaryIO, answer: BinaryIO) -> None:
     """Play the request of `skills.simulation.player` and write the measurements."""
-    asked: Asked = packing.read(given, {})
-    instrument, rate_hz = asked["instrument"], asked["rate_hz"]
-    with opened(instrument, rate_hz) as scene:
-        _set_up(scene, asked)
-        measured = kinematic_pass(scene, asked)
-        shown = _pictured(asked)
-        scene.pose(asked["joints"][shown])
-        if scene.psm_m is not None:
-            scene.pose(asked["m_joints"][shown], scene.psm_m)
-        picture = pictures.draw(scene.photograph, _paths(asked))
-        files = dict(sorted(scene.files.items()))
+    asked = packing.read(given, CLASSES)
+    assert isinstance(asked, PlayRequest)
+    motion = asked.trajectory
+    with opened(motion.instrument, motion.rate_hz) as scene:
+        scene.set_up(motion, asked.pad_top_mm)
+        kinematic = kinematic_pass(scene, asked)
+        shown = _pictured(motion)
+        scene.pose(motion.joints[shown])
+        if scene.psm_m is not None and motion.psm_m is not None:
+            scene.pose(motion.psm_m.joints[shown], scene.psm_m)
+        picture = pictures.draw(scene.photograph, _paths(motion))
+        files, pad_mm = dict(sorted(scene.files.items())), scene.pad_mm
     # In a fresh scene: PSM_M would take two thirds of each step, and earlier contacts influence later steps.
-    with opened(instrument, rate_hz) as scene:
-        scene.place_pad(asked["tip_mm"], asked["pad_top_mm"])
-        measured |= servo_pass(scene, asked)
-    measured |= {"picture_png": picture, "engine": f"PyBullet {version('pybullet')}", "files": files}
-    packing.write(answer, measured, {})
-
-
-def _set_up(scene: Simulator, asked: Asked) -> None:
-    scene.place_pad(asked["tip_mm"], asked["pad_top_mm"])
-    if "m_joints" in asked:
-        scene.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], asked["m_instrument"])
+    with opened(motion.instrument, motion.rate_hz) as scene:
+        scene.place_pad(motion.tip_mm, asked.pad_top_mm)
+        servo = servo_pass(scene, motion)
+    playback = Playback(
+        trajectory=motion,
+        **kinematic._asdict(),
+        **servo._asdict(),
+        pad_mm=pad_mm,
+        picture_png=picture,
+        engine=f"PyBullet {version('pybullet')}",
+        files=files,
+    )
+    packing.write(answer, playback, CLASSES)
 
 
 # ---- the kinematic pass ----------------------------------------------------------------------------------------
 
 
-def kinematic_pass(scene: Simulator, asked: Asked) -> Asked:
+def kinematic_pass(scene: Simulator, asked: PlayRequest) -> KinematicPass:
     """Set the joints at every sample and read them back, and measure distances.
 
     Distances are measured at the requested samples, and then at all others where links may be near each other.
     """
-    look = _Look(scene, asked)
+    motion = asked.trajectory
+    look = _Look(scene, motion)
     values, places, turns = array("d"), array("d"), array("d")
-    due = set(asked["looks"].tolist())
+    due = set(asked.looks.tolist())
     bullet, client, arm = scene.bullet, scene.client, scene.arm
     put, read_joints, read_link = bullet.resetJointStatesMultiDof, bullet.getJointStates, bullet.getLinkState
     number, joints, tool = arm.number, arm.joints, arm.tool
-    for k, row in enumerate(_rows(in_metres(asked["joints"])[:, :, None])):
+    for k, row in enumerate(_rows(in_metres(motion.joints)[:, :, None])):
         put(number, joints, row, physicsClientId=client)
         a, b, c, d, e, f = read_joints(number, joints, client)
         values.extend((a[0], b[0], c[0], d[0], e[0], f[0]))
@@ -375,11 +418,20 @@ def kinematic_pass(scene: Simulator, asked: Asked) -> Asked:
         if k in due:
             look.at(k)
     for k in _closer(look.seen_mm(), asked).tolist():
-        scene.pose(asked["joints"][k])
+        scene.pose(motion.joints[k])
         look.at(k)
     read = _table(values, 6)
     read[:, INSERTION] /= MM
-    return {"joints": read, "tip_mm": _table(places, 3) / MM, "rotation_xyzw": _table(turns, 4), **look.measured()}
+    looked_at, order = look.samples()
+    return KinematicPass(
+        tip_mm=_table(places, 3) / MM,
+        rotation_xyzw=_table(turns, 4),
+        joints=read,
+        looked_at=looked_at,
+        clearances_mm=look.seen_mm()[order],
+        shaft_off_mm=look.shaft_off_mm()[order],
+        psm_m_tip_mm=None if scene.psm_m is None else look.psm_m_tip_mm()[order],
+    )
 
 
 def _rows(values: Floats) -> Iterator[Any]:
@@ -392,24 +444,25 @@ def _table(values: "array[float]", columns: int) -> Floats:
     return np.array(values).reshape(-1, columns)
 
 
-def _closer(seen_mm: Floats, asked: Asked) -> Ints:
+def _closer(seen_mm: Floats, asked: PlayRequest) -> Ints:
     """Return the samples without a measurement at which links may be near each other."""
-    moving = {PSM_A: (asked["joints"], asked["instrument"])}
-    if "m_joints" in asked:
-        moving[PSM_M] = (asked["m_joints"], asked["m_instrument"])
-    bounds = Bounds.of(moving, link_pairs("m_joints" in asked), asked["looks"], seen_mm)
-    near = np.zeros(len(asked["joints"]), dtype=bool)
+    motion = asked.trajectory
+    moving = {PSM_A: (motion.joints, motion.instrument)}
+    if (m := motion.psm_m) is not None:
+        moving[PSM_M] = (m.joints, m.instrument)
+    bounds = Bounds.of(moving, link_pairs(m is not None), asked.looks, seen_mm)
+    near = np.zeros(len(motion), dtype=bool)
     for column in range(len(bounds.pairs)):
         near |= bounds.at_least_mm(column) < LOOK_CLOSER_MM
-    return np.setdiff1d(np.flatnonzero(near), asked["looks"])
+    return np.setdiff1d(np.flatnonzero(near), asked.looks)
 
 
 class _Look:
     """The measurements at some samples, with PSM_A already posed there; PSM_M, if it is in the scene, is posed here."""
 
-    def __init__(self, scene: Simulator, asked: Asked) -> None:
+    def __init__(self, scene: Simulator, motion: Trajectory) -> None:
         self._scene = scene
-        self._m_joints = asked.get("m_joints")
+        self._m_joints = None if motion.psm_m is None else motion.psm_m.joints
         self._pairs = _pairs_of_bodies(scene)
         self._nothing = [CLEARANCE_SEEN_MM * MM] * len(link_pairs(scene.psm_m is not None))
         self._samples: list[int] = []
@@ -436,18 +489,19 @@ class _Look:
         """Return the distances in the order of measurement, shape (C, P)."""
         return _table(self._seen, len(self._nothing)) / MM
 
-    def measured(self) -> Asked:
-        """Return all measurements in the order of samples."""
+    def samples(self) -> tuple[Ints, Ints]:
+        """Return the samples in ascending order, and their places in the order of measurement, shape (C,)."""
         order = np.argsort(self._samples)
+        return np.array(self._samples)[order], order
+
+    def shaft_off_mm(self) -> Floats:
+        """Return the distances of the shaft from its remote centre, in the order of measurement, shape (C,)."""
         place, along = _table(self._shaft_places, 3) / MM, matrix_of(_table(self._shaft_turns, 4))[:, :, 2]
-        found: Asked = {
-            "looked_at": np.array(self._samples)[order],
-            "clearances_mm": self.seen_mm()[order],
-            "shaft_off_mm": np.linalg.norm(np.cross(place, along), axis=1)[order],
-        }
-        if self._m_places:
-            found["psm_m_tip_mm"] = _table(self._m_places, 3)[order] / MM
-        return found
+        return np.asarray(np.linalg.norm(np.cross(place, along), axis=1))
+
+    def psm_m_tip_mm(self) -> Floats:
+        """Return PSM_M's tip in the order of measurement, shape (C, 3)."""
+        return _table(self._m_places, 3) / MM
 
 
 @dataclass(frozen=True)
@@ -477,11 +531,11 @@ def _pairs_of_bodies(scene: Simulator) -> list[_BodyPair]:
 # ---- the servo pass --------------------------------------------------------------------------------------------
 
 
-def servo_pass(scene: Simulator, asked: Asked) -> Asked:
-    """Let the motors follow, and return the tip's error, the motors' efforts, the pad's force, and seconds per step."""
-    wanted = np.pad(in_metres(asked["joints"]), ((0, 0), (0, 2)), constant_values=HOLDING_RAD)
-    velocities = np.diff(wanted, axis=0) * asked["rate_hz"]
-    scene.pose(asked["joints"][0])
+def servo_pass(scene: Simulator, motion: Trajectory) -> ServoPass:
+    """Let the motors follow, and measure the tip's error, the motors' efforts and the pad's force."""
+    wanted = np.pad(in_metres(motion.joints), ((0, 0), (0, 2)), constant_values=HOLDING_RAD)
+    velocities = np.diff(wanted, axis=0) * motion.rate_hz
+    scene.pose(motion.joints[0])
     places, efforts, pressed = array("d"), array("d", [0.0] * 6), array("d", [0.0])
     places.extend(scene.frame_of(scene.arm, scene.arm.tool)[0])
     began = time.perf_counter()
@@ -492,24 +546,24 @@ def servo_pass(scene: Simulator, asked: Asked) -> Asked:
         places.extend(scene.frame_of(scene.arm, scene.arm.tool)[0])
         pressed.append(scene.pressed_n())
     seconds = time.perf_counter() - began
-    return {
-        "tracking_mm": np.linalg.norm(_table(places, 3) / MM - asked["tip_mm"], axis=1),
-        "efforts": _table(efforts, 6),
-        "contact_n": np.array(pressed),
-        "seconds_per_step": seconds / max(1, len(velocities)),
-    }
+    return ServoPass(
+        tracking_mm=np.linalg.norm(_table(places, 3) / MM - motion.tip_mm, axis=1),
+        efforts=_table(efforts, 6),
+        contact_n=np.array(pressed),
+        seconds_per_step=seconds / max(1, len(velocities)),
+    )
 
 
 # ---- the picture -----------------------------------------------------------------------------------------------
 
 
-def _paths(asked: Asked) -> list[Floats]:
+def _paths(motion: Trajectory) -> list[Floats]:
     """Return the path of the tip in A1 of each pass, in metres, each of shape (K, 3)."""
-    number, tip, first = asked["pass_index"], asked["tip_mm"] * MM, asked["phase"] == A1
-    return [tip[(number == one) & first] for one in range(int(number[-1]) + 1)]
+    first = motion.phase == A1
+    return [motion.tip_mm[(motion.pass_index == one) & first] * MM for one in range(motion.passes)]
 
 
-def _pictured(asked: Asked) -> int:
+def _pictured(motion: Trajectory) -> int:
     """Choose the sample of the picture: half-way through A1 of the last pass."""
-    last = np.flatnonzero((asked["pass_index"] == asked["pass_index"][-1]) & (asked["phase"] == A1))
-    return int(last[len(last) // 2]) if len(last) else len(asked["joints"]) - 1
+    last = np.flatnonzero((motion.pass_index == motion.pass_index[-1]) & (motion.phase == A1))
+    return int(last[len(last) // 2]) if len(last) else len(motion) - 1

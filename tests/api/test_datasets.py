@@ -11,8 +11,8 @@ import pytest
 from skills.api import responses
 from skills.client import Problem
 from skills.errors import BadInput, Conflict
-from skills.formats import write_mcap
-from skills.formats.lerobot import check_dataset
+from skills.formats.bag_writer import write_mcap
+from skills.formats.lerobot.manifest import check_dataset
 from skills.library.recordings import datasets
 from tests.api.keyed import As, key
 from tests.api.service import KESTREL, MCAP, Service, assert_problem

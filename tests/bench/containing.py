@@ -18,7 +18,7 @@ from rich.table import Table
 
 from skills.formats.reader_process import ConfinedReader
 from skills.sandbox import ProcessLimits, forked
-from skills.sandbox.containment import Allowance, code_folders, enter, offered, shut
+from skills.sandbox.containment import Allowance, code_folders, enter, offered
 from skills.sandbox.forked import ForkServer, call_alone, layers_held
 from skills.simulation.player import play
 from tests.bench.timing import in_turn
@@ -61,9 +61,9 @@ def _entering_s(place: Allowance) -> tuple[float, float]:
     if (pid := os.fork()) == 0:
         try:
             began = time.thread_time()
-            enter(place, held)
+            enter(place, held, of_server=True)
             entered = time.thread_time()
-            shut(place, held)
+            enter(place, held, of_server=False)
             os.write(send, json.dumps((entered - began, time.thread_time() - entered)).encode())
         finally:
             os._exit(0)

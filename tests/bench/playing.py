@@ -3,7 +3,6 @@
 import hashlib
 import time
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -43,7 +42,7 @@ def playing(table: Table) -> None:
     ours, bare, quick = in_turn(
         lambda: measure(asked), lambda: plain(asked), lambda: plain(asked, at_once=True), rounds=ROUNDS
     )
-    samples = f"{len(trajectory)} samples, {len(asked['looks'])} looks; no process start"
+    samples = f"{len(trajectory)} samples, {len(asked.looks)} looks; no process start"
     table.add_row(f"{PASSES} passes checked, {RATE_HZ:.0f} Hz", f"{ours:.2f} s", samples)
     table.add_row("  PyBullet's calls alone", f"{bare:.2f} s", f"ours takes {ours / bare:.2f} of it")
     table.add_row("  with six joints in one call, too", f"{quick:.2f} s", f"ours takes {ours / quick:.2f} of it")
@@ -100,32 +99,31 @@ def two_at_once(trajectory: Trajectory, table: Table) -> None:
     table.add_row("  two hashes at once", "", f"{hashing:.2f} x one after the other")
 
 
-def measure(asked: dict[str, Any]) -> None:
+def measure(asked: simulator.PlayRequest) -> None:
     """Do the work of a check in the simulator, except for the picture."""
-    instrument, rate_hz = str(asked["instrument"]), float(asked["rate_hz"])
-    with simulator.opened(instrument, rate_hz) as one:
-        one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
-        one.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], instrument)
+    motion = asked.trajectory
+    with simulator.opened(motion.instrument, motion.rate_hz) as one:
+        one.set_up(motion, asked.pad_top_mm)
         simulator.kinematic_pass(one, asked)
-    with simulator.opened(instrument, rate_hz) as one:
-        one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
-        simulator.servo_pass(one, asked)
+    with simulator.opened(motion.instrument, motion.rate_hz) as one:
+        one.place_pad(motion.tip_mm, asked.pad_top_mm)
+        simulator.servo_pass(one, motion)
 
 
-def plain(asked: dict[str, Any], at_once: bool = False) -> None:
+def plain(asked: simulator.PlayRequest, at_once: bool = False) -> None:
     """Make the same PyBullet calls and nothing else, and discard their results.
 
     `at_once` sets six joints in one call (`resetJointStatesMultiDof`), as `measure` does; the plain way is six calls.
     """
-    instrument, rate_hz = str(asked["instrument"]), float(asked["rate_hz"])
-    arm_rows, m_rows = (simulator.in_metres(asked[name]).tolist() for name in ("joints", "m_joints"))
-    with simulator.opened(instrument, rate_hz) as one:
-        one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
-        one.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], instrument)
-        _plain_kinematic(one, arm_rows, m_rows, set(asked["looks"].tolist()), at_once)
-    with simulator.opened(instrument, rate_hz) as one:
-        one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
-        _plain_servo(one, arm_rows, rate_hz)
+    motion = asked.trajectory
+    assert motion.psm_m is not None
+    arm_rows, m_rows = (simulator.in_metres(joints).tolist() for joints in (motion.joints, motion.psm_m.joints))
+    with simulator.opened(motion.instrument, motion.rate_hz) as one:
+        one.set_up(motion, asked.pad_top_mm)
+        _plain_kinematic(one, arm_rows, m_rows, set(asked.looks.tolist()), at_once)
+    with simulator.opened(motion.instrument, motion.rate_hz) as one:
+        one.place_pad(motion.tip_mm, asked.pad_top_mm)
+        _plain_servo(one, arm_rows, motion.rate_hz)
 
 
 def _plain_kinematic(

@@ -145,7 +145,7 @@ def test_samples_recorded_twice_are_dropped_and_counted():
     ("text", "how", "error", "message"),
     [
         (without(PLAIN, "psm1_pose.position.y"), {}, BadColumns, "y of PSM1's pose is missing"),
-        (without(MORE, "psm1_js[2]"), {}, BadColumns, "q3 of PSM1's js is missing"),
+        (without(MORE, "psm1_js[2]"), {}, BadColumns, "q3 of PSM1's joints is missing"),
         (PLAIN.replace("psm1_sp.position.x", "psm1_pose.position.x", 1), {}, BadColumns, "twice"),
         (PLAIN.replace("psm1_sp.position.x", "timestamp", 1), {}, BadColumns, "twice"),
         (PLAIN[:-3], {}, UnreadableRecording, "was cut"),

@@ -17,9 +17,9 @@ import pytest
 from skills.demonstration.recording import Label, Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
 from skills.formats import read_recording, write_mcap
+from skills.formats.checksums import SUMS
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.lerobot.writer import (
-    MANIFEST,
     TABLE_ROWS,
     AboutDataset,
     ExportedEpisode,
@@ -132,15 +132,15 @@ def test_statistics_are_those_of_all_frames(tmp_path):
 @pytest.mark.parametrize("version", VERSIONS)
 def test_the_manifest_has_every_other_file(tmp_path, version):
     folder = written(tmp_path, episodes(), version)
-    lines = [line.split("  ") for line in (folder / MANIFEST).read_text().splitlines()]
+    lines = [line.split("  ") for line in (folder / SUMS).read_text().splitlines()]
     files = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-    assert [name for _, name in lines] == sorted(set(files) - {MANIFEST})
+    assert [name for _, name in lines] == sorted(set(files) - {SUMS})
     for digest, name in lines:
         assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
 
 
 def test_the_same_episodes_make_the_same_bytes(tmp_path):
-    one, other = (written(tmp_path / name, episodes(), "v3.0") / MANIFEST for name in ("a", "b"))
+    one, other = (written(tmp_path / name, episodes(), "v3.0") / SUMS for name in ("a", "b"))
     assert one.read_bytes() == other.read_bytes()
 
 

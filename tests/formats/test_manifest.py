@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from skills.errors import BadInput, Corrupt, UnreadableRecording
-from skills.formats.lerobot import MANIFEST, check_dataset, unpack_dataset
+from skills.formats.checksums import SUMS
+from skills.formats.lerobot.manifest import check_dataset, unpack_dataset
 from skills.formats.lerobot.writer import dataset_files
 from tests.formats.test_lerobot_writer import ABOUT, episodes
 
@@ -45,7 +46,7 @@ def with_line(name: str) -> dict[str, bytes]:
     """Return a dataset with another file, which its manifest names."""
     content = files() | {name: b""}
     empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
-    return content | {MANIFEST: content[MANIFEST] + f"{empty}  {name}\n".encode()}
+    return content | {SUMS: content[SUMS] + f"{empty}  {name}\n".encode()}
 
 
 @pytest.mark.parametrize("name", ["../out", "/out", "data/../../out", "a\\b", "C:/x", "..", "data/.", "a//b", "é"])
@@ -58,7 +59,7 @@ def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str):
 def test_a_file_that_is_changed_missing_or_added_is_refused(tmp_path: Path):
     changed = files() | {"meta/info.json": b"{}"}
     missing = {name: data for name, data in files().items() if name != "meta/info.json"}
-    unnamed = {name: data for name, data in files().items() if name != MANIFEST}
+    unnamed = {name: data for name, data in files().items() if name != SUMS}
     for content in (changed, missing, unnamed, files() | {"more": b""}, {}):
         with pytest.raises(Corrupt):
             unpack_dataset(zip_of(content), tmp_path / "dataset")

@@ -12,9 +12,9 @@ from skills.demonstration.recording import Recording
 from skills.errors import NoUsableTopic
 from skills.formats import bag_writer as messages
 from skills.formats import read_recording, topics
-from skills.formats.bag_folder import join
 from skills.formats.bag_writer import Message, messages_of, write_messages
 from skills.formats.columns import APART_MM
+from skills.formats.join import join
 from skills.formats.mcap import read_mcap
 from skills.formats.parsed import parse
 from skills.formats.reader_process import KNOWN

@@ -4,7 +4,7 @@ import pytest
 
 from skills.demonstration.recording import Label
 from skills.errors import UnreadableRecording
-from skills.formats.bag_folder import read_labels
+from skills.formats.tags import read_labels
 
 T = 1_760_000_000_000_000_000
 FRAMES = [T + k * 33_333_333 for k in range(100)]

@@ -45,11 +45,10 @@ def test_a_layer_that_is_not_entered_is_not_said_to_hold(tmp_path):
     code = (
         "import json, sys; from skills.sandbox import containment as c; "
         "place = c.Allowance(sys.argv[1], tuple(c.code_folders())); held = {}\n"
-        "for layers in (c._OF_SERVER, c._OF_FORK):\n"
-        "    for name, (apply, holds) in layers.items():\n"
-        "        layers[name] = lambda place: None, holds\n"
-        "        held[name] = c.offered(place)\n"
-        "        layers[name] = apply, holds\n"
+        "for name, layer in list(c._LAYERS.items()):\n"
+        "    c._LAYERS[name] = layer._replace(apply=lambda place: None)\n"
+        "    held[name] = c.offered(place)\n"
+        "    c._LAYERS[name] = layer\n"
         "print(json.dumps(held))"
     )
     done = subprocess.run([sys.executable, "-c", code, tmp_path], cwd=PROJECT, stdout=subprocess.PIPE, check=True)

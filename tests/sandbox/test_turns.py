@@ -6,7 +6,7 @@ from threading import Event, Thread
 import pytest
 
 from skills.errors import Busy
-from skills.sandbox.forked import Turns
+from skills.sandbox.turns import Turns
 from tests.waiting import END_S, until
 
 

@@ -1,75 +1,86 @@
 """Simulators with one fault each, to be named to `play` or `shoot` in place of the real one."""
 
 from collections.abc import Callable
+from dataclasses import make_dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from skills import packing
+from skills.arrays import Floats
+from skills.simulation import referee, simulator
+from skills.verification.playback import Playback
 from tests.sandbox.faults import crash, eat_memory, fail, garbage, hang, nothing, with_pickles  # noqa: F401 - by name
 
 
-def _answering(change: Callable[[dict[str, Any]], object]) -> Callable[[BinaryIO, BinaryIO], None]:
-    """Return a simulator that measures exactly the requested values, but for a change to its answer."""
+def _answering(**changed: Any) -> Callable[[BinaryIO, BinaryIO], None]:
+    """Return a simulator that measures exactly the requested values, but for changed fields of its answer."""
 
     def simulate(given: BinaryIO, answer: BinaryIO) -> None:
-        measured = _exact(packing.read(given, {}))
-        change(measured)
-        packing.write(answer, measured, {})
+        playback = _exact(packing.read(given, simulator.CLASSES))
+        for name, value in changed.items():  # not through the constructor, which checks them
+            object.__setattr__(playback, name, value(getattr(playback, name)) if callable(value) else value)
+        packing.write(answer, playback, simulator.CLASSES)
 
     return simulate
 
 
-def _exact(asked: dict[str, Any]) -> dict[str, Any]:
-    count = len(asked["tip_mm"])
-    return {
-        "tip_mm": asked["tip_mm"],
-        "rotation_xyzw": asked["rotation_xyzw"],
-        "joints": asked["joints"].copy(),
-        "tracking_mm": np.zeros(count),
-        "efforts": np.zeros((count, 6)),
-        "contact_n": np.zeros(count),
-        "looked_at": asked["looks"],
-        "clearances_mm": np.full((len(asked["looks"]), 4), 5.0),
-        "shaft_off_mm": np.zeros(len(asked["looks"])),
-        "files": {"psm.urdf": "0" * 64},
-        "picture_png": b"\x89PNG\r\n\x1a\n",
-        "engine": "none",
-        "seconds_per_step": 1e-5,
-    }
+def _exact(asked: simulator.PlayRequest) -> Playback:
+    motion = asked.trajectory
+    count, looks = len(motion), len(asked.looks)
+    return Playback(
+        trajectory=motion,
+        tip_mm=motion.tip_mm,
+        rotation_xyzw=motion.rotation_xyzw,
+        joints=motion.joints,
+        tracking_mm=np.zeros(count),
+        efforts=np.zeros((count, 6)),
+        contact_n=np.zeros(count),
+        looked_at=asked.looks,
+        clearances_mm=np.full((looks, 4), 5.0),
+        shaft_off_mm=np.zeros(looks),
+        psm_m_tip_mm=None,
+        pad_mm=np.append(motion.tip_mm[:, :2].mean(axis=0), asked.pad_top_mm),
+        picture_png=b"\x89PNG\r\n\x1a\n",
+        engine="none",
+        files={"psm.urdf": "0" * 64},
+        seconds_per_step=1e-5,
+    )
 
 
-def _put(name: str, at: Any, value: float) -> Callable[[dict[str, Any]], object]:
-    return lambda measured: measured[name].__setitem__(at, value)
+def _with_nan(at: Any) -> Callable[[Floats], Floats]:
+    def change(values: Floats) -> Floats:
+        changed = values.copy()
+        changed[at] = np.nan
+        return changed
+
+    return change
 
 
-sound = _answering(lambda measured: None)
-not_a_number = _answering(_put("tracking_mm", 3, np.nan))
-nan_joint = _answering(_put("joints", (3, 2), np.nan))
-nan_clearance = _answering(_put("clearances_mm", (3, 1), np.nan))
-looked_the_other_way = _answering(lambda measured: measured.update(looked_at=measured["looked_at"][::-1]))
-no_such_file = _answering(lambda measured: measured.update(files={"../psm.urdf": "0" * 64}))
-no_digest = _answering(lambda measured: measured.update(files={"psm.urdf": 0}))
-too_short = _answering(lambda measured: measured.update(tip_mm=measured["tip_mm"][:-1]))
-whole_numbers = _answering(lambda measured: measured.update(joints=measured["joints"].astype(np.int64)))
-no_array = _answering(lambda measured: measured.update(joints=measured["joints"].tolist()))
-no_picture = _answering(lambda measured: measured.update(picture_png=b"GIF89a"))
-no_bytes = _answering(lambda measured: measured.update(picture_png="\x89PNG\r\n\x1a\n"))
-no_name = _answering(lambda measured: measured.update(engine=""))
-no_duration = _answering(lambda measured: measured.update(seconds_per_step="1e-5"))
-incomplete = _answering(lambda measured: measured.pop("clearances_mm"))
+sound = _answering()
+not_a_number = _answering(tracking_mm=_with_nan(3))
+nan_joint = _answering(joints=_with_nan((3, 2)))
+nan_clearance = _answering(clearances_mm=_with_nan((3, 1)))
+looked_the_other_way = _answering(looked_at=lambda samples: samples[::-1])
+no_such_file = _answering(files={"../psm.urdf": "0" * 64})
+no_digest = _answering(files={"psm.urdf": 0})
+too_short = _answering(tip_mm=lambda tip_mm: tip_mm[:-1])
+no_numbers = _answering(joints="joints")
+another_arm = _answering(psm_m_tip_mm=lambda _: np.zeros((1, 3)))
+no_picture = _answering(picture_png=b"GIF89a")
+no_bytes = _answering(picture_png="\x89PNG\r\n\x1a\n")
+no_name = _answering(engine="")
+no_duration = _answering(seconds_per_step="1e-5")
 
 
-def no_film(given: BinaryIO, answer: BinaryIO) -> None:
-    packing.write(answer, {}, {})
+def _writing(value: Any) -> Callable[[BinaryIO, BinaryIO], None]:
+    return lambda given, answer: packing.write(answer, value, packing.known(type(value)) if value else {})
 
 
-def no_gif(given: BinaryIO, answer: BinaryIO) -> None:
-    packing.write(answer, {"mp4": b"\0\0\0\x20ftypisom", "gif": b"GIF"}, {})
-
-
-def film_in_words(given: BinaryIO, answer: BinaryIO) -> None:
-    packing.write(answer, {"mp4": "\0\0\0\x20ftypisom", "gif": ["GIF89a"]}, {})
+incomplete = _writing(make_dataclass("Playback", ["engine"])("none"))
+no_film = _writing({})
+no_gif = _writing(make_dataclass("Film", ["mp4", "gif"])(b"\0\0\0\x20ftypisom", b"GIF"))
+film_in_words = _writing(make_dataclass("Film", ["mp4", "gif"])("\0\0\0\x20ftypisom", ["GIF89a"]))
 
 
 # ---- of the contact referee --------------------------------------------------------------------------------------
@@ -79,9 +90,11 @@ def _refereeing(**changed: Any) -> Callable[[BinaryIO, BinaryIO], None]:
     """Return a referee that holds every needle, but for a change to its answer."""
 
     def trials(given: BinaryIO, answer: BinaryIO) -> None:
-        total = int(packing.read(given, {})["trials"].sum())
-        sound = {"ended": np.zeros(total, np.int64), "motion": np.zeros((total, 3)), "engine": "none"}
-        packing.write(answer, sound | changed, {})
+        total = sum(packing.read(given, referee.CLASSES).counts)
+        outcomes = referee.Outcomes(np.zeros(total, np.int64), np.zeros((total, 3)), "none")
+        for name, value in changed.items():
+            object.__setattr__(outcomes, name, value)
+        packing.write(answer, outcomes, referee.CLASSES)
 
     return trials
 

@@ -29,6 +29,19 @@ def exactly(trajectory=ONE, **given) -> Refereed:
     return referee(trajectory, errors=EXACT, trials=1, settings=NO_DOUBT, **given)
 
 
+def requested(trajectory, number, drawn, errors=EXACT):
+    """Return the request for the trials of a pass in drawn worlds."""
+    watched = refereeing._watched(trajectory, number)
+    displaced = drawn.under(errors, trajectory.stamps_s[watched])
+    return refereeing._request(trajectory, number, watched, drawn, displaced, (), ())
+
+
+def strokes(trajectory):
+    """Return the request for one trial of the first pass, for its jaws."""
+    watched = refereeing._watched(trajectory, 0)
+    return requested(trajectory, 0, draw(0, 0, 1, len(watched), suture_point_mm=0.0, needle_rad=0.0))
+
+
 def elsewhere(by_mm=(0.0, 0.0, 0.0), axis: int = 0, angle_deg: float = 0.0):
     """Return the plan with PSM_M's whole arm moved along [n o a] of its jaws, or turned about one of them."""
     psm_m = ONE.psm_m
@@ -87,23 +100,19 @@ def test_the_worlds_of_the_trials_are_those_of_the_closed_form():
     trajectory, count = BESIDE, 5
     watched = refereeing._watched(trajectory, 1)
     drawn = draw(3, 1, count, len(watched), suture_point_mm=5.0, needle_rad=0.2)
-    world = refereeing._worlds(trajectory, watched, drawn, drawn.under(EXACT, trajectory.stamps_s[watched]))
+    world = requested(trajectory, 1, drawn)
     hinge, jaw = psm_m_poses(trajectory, watched)
-    np.testing.assert_allclose(world["tip_mm"][:, 1], hinge + drawn.shift_mm[:, None], atol=1e-9)
-    np.testing.assert_allclose(world["jaw"][2, 1], jaw, atol=1e-12)
+    np.testing.assert_allclose(world.tip_mm[:, 1], hinge + drawn.shift_mm[:, None], atol=1e-9)
+    np.testing.assert_allclose(world.jaw[2, 1], jaw, atol=1e-12)
     grip, needle = needle_poses(trajectory, watched)
-    np.testing.assert_allclose(world["needle_mm"], grip[0] + drawn.shift_mm, atol=1e-9)
+    np.testing.assert_allclose(world.needle_mm, grip[0] + drawn.shift_mm, atol=1e-9)
     # As PSM_A turns, the needle's error goes with its jaws, and at the hand-off it is the one that was drawn.
-    along = world["jaw"][:, 0, -1] @ np.swapaxes(world["jaw"][:, 0, 0], 1, 2) @ world["needle"]
+    along = world.jaw[:, 0, -1] @ np.swapaxes(world.jaw[:, 0, 0], 1, 2) @ world.needle
     np.testing.assert_allclose(along, drawn.turned @ needle[-1], atol=1e-9)
 
-    base = refereeing._worlds(
-        trajectory, watched, drawn, drawn.under(only(registration_mm=2.0), trajectory.stamps_s[watched])
-    )
-    np.testing.assert_allclose(
-        base["tip_mm"][:, 1] - world["tip_mm"][:, 1], 2 * drawn.registration[:, None] + 0 * hinge
-    )
-    np.testing.assert_array_equal(base["tip_mm"][:, 0], world["tip_mm"][:, 0])
+    base = requested(trajectory, 1, drawn, only(registration_mm=2.0))
+    np.testing.assert_allclose(base.tip_mm[:, 1] - world.tip_mm[:, 1], 2 * drawn.registration[:, None] + 0 * hinge)
+    np.testing.assert_array_equal(base.tip_mm[:, 0], world.tip_mm[:, 0])
 
 
 def test_the_trial_begins_where_no_finger_can_have_touched_the_needle():
@@ -123,17 +132,17 @@ def test_arms_are_followed_until_they_stand_and_jaws_then_move_as_planned():
     assert (mine[-1], theirs[-1]) == (2 * OPEN_RAD, JAW_CLOSED_RAD)
     assert theirs[1] < theirs[0] and (theirs[mine > mine[0]] == JAW_CLOSED_RAD).all()
     # The trial commands these angles at the plan's own times, and then goes back no faster than the plan.
-    strokes = refereeing._strokes(ONE, 0, int(end))
-    np.testing.assert_array_equal(strokes["jaws_rad"], [mine, theirs])
-    np.testing.assert_allclose(strokes["jaws_s"], ONE.stamps_s[end : last + 1] - ONE.stamps_s[end])
-    assert strokes["jaws_s"][-1] == pytest.approx(2 * JAW_S, abs=0.011)
-    assert strokes["back_s"] == pytest.approx(1.875 * 18 / ONE.speed_mm_s)
+    asked = strokes(ONE)
+    np.testing.assert_array_equal(asked.jaws_rad, [mine, theirs])
+    np.testing.assert_allclose(asked.jaws_s, ONE.stamps_s[end : last + 1] - ONE.stamps_s[end])
+    assert asked.jaws_s[-1] == pytest.approx(2 * JAW_S, abs=0.011)
+    assert asked.back_s == pytest.approx(1.875 * 18 / ONE.speed_mm_s)
 
 
 def test_a_jaw_that_holds_less_than_closed_grips_with_all_its_torque():
     held = np.where(ONE.jaw_rad == JAW_CLOSED_RAD, 0.1, ONE.jaw_rad)
     end = int(refereeing._watched(ONE, 0)[-1])
-    (mine, _) = refereeing._strokes(replace(ONE, jaw_rad=held), 0, end)["jaws_rad"]
+    mine, _ = strokes(replace(ONE, jaw_rad=held)).jaws_rad
     np.testing.assert_array_equal(mine, ONE.jaw_rad[end : ONE.last_samples[0] + 1])
 
 

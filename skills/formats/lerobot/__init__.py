@@ -1,4 +1,4 @@
-"""LeRobot datasets of a dVRK, v2.1 and v3.0: their metadata and manifest, and reading, cutting and writing them.
+"""LeRobot datasets of a dVRK, v2.1 and v3.0: their metadata, and reading, cutting and writing them.
 
     folder or zip --find_dataset--> Dataset --cut_episode--> zip of one episode --read_episode--> Recording
 
@@ -11,29 +11,20 @@ One episode is one recording: a reader refuses several, so that the stored bytes
     videos/, images          not used
 
 Paths in `info.json` (`data_path`) are never used: files are found by their own names.
-
-A written dataset has a manifest: `unpack_dataset` verifies every file against its SHA-256 before the folder appears.
-Only what `skills.formats.lerobot.writer` writes into a zip is unpacked: files that are not compressed, so that none is
-larger than the zip itself, with names that stay in the folder, each of them named by the manifest and no other.
 """
 
-import hashlib
 import json
-import os
 import re
-import secrets
-import shutil
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
-from pathlib import Path, PurePosixPath
-from typing import IO, Any, BinaryIO, Protocol
-from zipfile import ZIP_STORED, ZipFile
+from pathlib import PurePosixPath
+from typing import Any, BinaryIO, Protocol
 
-from skills.errors import BadInput, Corrupt, UnreadableRecording
-from skills.formats.archive import refusing, shown
+from skills.errors import UnreadableRecording
+from skills.formats.archive import shown
 from skills.formats.lerobot.parquet import ParquetColumn, open_parquet, printable, read_rows
 
 INFO, SAID, TASK_LINES, TASK_TABLE = (
@@ -261,87 +252,3 @@ def is_shadow(name: str) -> bool:
     """Return whether a file holds only macOS metadata of another file."""
     path = PurePosixPath(name)
     return path.name.startswith("._") or "__MACOSX" in path.parts
-
-
-MANIFEST = "SHA256SUMS"
-
-AGAIN = "Download it again."
-_LINE = re.compile(r"([0-9a-f]{64})  (\S+)")
-_NAME = re.compile(r"(?:[A-Za-z0-9_-][A-Za-z0-9._-]*/)*[A-Za-z0-9._-]*[A-Za-z0-9_-][A-Za-z0-9._-]*")
-_PIECE = 1 << 20
-_MANIFEST_BYTES = 16 << 20  # 100,000 files
-
-
-def check_dataset(file: BinaryIO) -> list[str]:
-    """Verify every file of a dataset's zip against its manifest, and return their names.
-
-    Raises:
-        Corrupt: A file differs from its digest, is missing, or is not in the manifest.
-        UnreadableRecording: It is not a zip, or is damaged.
-    """
-    return _copied(file, None)
-
-
-def unpack_dataset(file: BinaryIO, folder: Path) -> list[str]:
-    """Unpack a dataset's zip into a new folder, which appears only when all files are verified; return their names.
-
-    Raises:
-        BadInput: There is something at the folder's path.
-        Corrupt, UnreadableRecording: As `check_dataset`.
-    """
-    refuse_existing(folder)
-    part = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}")
-    part.mkdir()
-    try:
-        names = _copied(file, part)
-        refuse_existing(folder)  # again: meanwhile somebody else may have made it
-        part.rename(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return names
-
-
-def refuse_existing(path: Path) -> None:
-    """Refuse to overwrite something.
-
-    Raises:
-        BadInput: There is a file, a folder or a link at the path.
-    """
-    if path.exists() or path.is_symlink():
-        raise BadInput(f"{path} exists already, and is not overwritten.", "Name a new folder, or a new .zip.")
-
-
-def _copied(file: BinaryIO, folder: Path | None) -> list[str]:
-    with refusing("The dataset's zip", AGAIN), ZipFile(file) as archive:
-        found = {one.filename: one for one in archive.infolist()}
-        named = _manifest(archive) if MANIFEST in found else {}
-        if len(found) != len(archive.infolist()) or found.keys() != {*named, MANIFEST} or not named:
-            raise Corrupt(f"The files of the dataset are not those of its manifest. {AGAIN}")
-        for name, member in found.items():
-            if member.compress_type != ZIP_STORED or _NAME.fullmatch(name) is None:
-                raise Corrupt(f"The dataset's zip has a member that no export writes. {AGAIN}")
-            with archive.open(member) as content:
-                digest = _copy(content, None if folder is None else folder / name)
-            if name != MANIFEST and digest != named[name]:
-                raise Corrupt(f"{name} of the dataset does not match its manifest. {AGAIN}")
-    return sorted(found)
-
-
-def _manifest(archive: ZipFile) -> dict[str, str]:
-    if archive.getinfo(MANIFEST).file_size > _MANIFEST_BYTES:
-        raise Corrupt(f"The dataset's manifest is too long. {AGAIN}")
-    lines = archive.read(MANIFEST).decode("ascii").splitlines()
-    found = [_LINE.fullmatch(line) for line in lines]
-    return {one[2]: one[1] for one in found if one is not None} if all(found) else {}
-
-
-def _copy(content: IO[bytes], to: Path | None) -> str:
-    """Write a file, unless `to` is None, and return its SHA-256."""
-    seen = hashlib.sha256()
-    if to is not None:
-        to.parent.mkdir(parents=True, exist_ok=True)
-    with open(os.devnull if to is None else to, "wb") as out:
-        while data := content.read(_PIECE):
-            seen.update(data)
-            out.write(data)
-    return seen.hexdigest()

@@ -29,12 +29,25 @@ from dataclasses import replace
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic, recorded_motion
+from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic
 from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
-from skills.formats.columns import BASE, ColumnSetpoints, check_outside
+from skills.formats.columns import (
+    BASE,
+    POSE_PARTS,
+    SETPOINTS,
+    Parts,
+    Quantity,
+    check_outside,
+    in_mm,
+    pose_motion,
+    pose_of,
+    scaled,
+    setpoints_in,
+    topic_of,
+)
 from skills.formats.lerobot import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
 from skills.formats.lerobot.parquet import ParquetTable, printable, read_columns
-from skills.kinematics import INSERTION, INSTRUMENTS, forward, quaternion_of
+from skills.kinematics import INSTRUMENTS
 from skills.remedies import Action, Remedy, did_you_mean
 
 NOTE_CHARACTERS = 200
@@ -55,24 +68,11 @@ _JAW = re.compile(r"(?:observation\.state\.)?(psm\d{1,2})[._](?:jaw|gripper)(_sp
 _TOOL = re.compile(r"(?:observation\.meta\.tool\.)?(psm\d{1,2})(?:_tool_type)?", re.I)
 _NUMBER = re.compile(r"(?:^|:)(\d+)(?:\[|$)")  # of "LARGE_NEEDLE_DRIVER:400006[..11]", or alone
 _FRAME = re.compile(r"[A-Za-z0-9_./-]{1,64}")
-_POSE_PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
 _JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 _SCALARS = ("timestamp", "frame_index", "episode_index", "task_index")
 _SEC, _NANOSEC = "observation.meta.ros_time_sec", "observation.meta.ros_time_nsec"
-_TOPICS = {
-    "local_pose": "/{}/local/measured_cp",
-    "pose": "/{}/measured_cp",
-    "joints": "/{}/measured_js",
-    "jaw": "/{}/jaw/measured_js",
-    "setpoint": "/{}/setpoint_cp",
-    "local_setpoint": "/{}/local/setpoint_cp",
-    "joint_setpoints": "/{}/setpoint_js",
-    "jaw_setpoint": "/{}/jaw/setpoint_js",
-}
-_SETPOINTS = ("setpoint", "local_setpoint", "joint_setpoints", "jaw_setpoint")
 
 Place = tuple[str, int]  # a feature, and the index of one of its numbers
-Quantity = tuple[str, str]  # an arm such as "PSM1", and a key of `_TOPICS`
 LeftOut = tuple[str, str]  # a topic or a feature, and why it is not used
 
 
@@ -105,7 +105,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         table = _read(dataset, meanings | commanded)
     except UnreadableRecording as error:
         table = _read(dataset, meanings)  # which raises if the fault is not one of setpoints
-        unknown += [(_topic(*quantity), str(error)) for quantity in commanded]
+        unknown += [(topic_of(*quantity), str(error)) for quantity in commanded]
         commanded = {}
     _check_one_episode(dataset, table)
     stamps_ns, clock = _stamps_ns(dataset, table)
@@ -113,18 +113,19 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
     values = _values(table, meanings)
     tools = _tools(dataset, table)
     joints = {
-        arm: Joints(arm, _topic(arm, kind), stamps_ns, _in_mm(one))
+        arm: Joints(arm, topic_of(arm, kind), stamps_ns, one[0])
         for (arm, kind), one in values.items()
         if kind == "joints"
     }
     motions, left_out = _motions(values, joints, tools, stamps_ns, _frames(dataset, frame, {arm for arm, _ in values}))
-    setpoints = _setpoints(_values(table, commanded), motions, tools, stamps_ns)
+    instruments = {arm: number for arm, tool in tools.items() if (number := _number(tool)) is not None}
+    setpoints = setpoints_in(_values(table, commanded), motions, instruments, stamps_ns)
     return Recording(
         format="lerobot",
         integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
         motions=motions,
         jaws=tuple(
-            (arm, Signal(stamps_ns, one[:, 0], _topic(arm, kind)))
+            (arm, Signal(stamps_ns, one[0][:, 0], topic_of(arm, kind)))
             for (arm, kind), one in values.items()
             if kind == "jaw"
         ),
@@ -146,12 +147,18 @@ def _read(dataset: Dataset, meanings: Mapping[Quantity, Mapping[int, Place]]) ->
         return read_columns(file, [one.column for one in features])
 
 
-def _values(table: ParquetTable, meanings: Mapping[Quantity, Mapping[int, Place]]) -> dict[Quantity, Floats]:
-    """Return the numbers of each quantity, shape (T, K)."""
-    return {
-        quantity: table.stacked([place for _, place in sorted(places.items())])
-        for quantity, places in sorted(meanings.items())
-    }
+def _values(table: ParquetTable, meanings: Mapping[Quantity, Mapping[int, Place]]) -> dict[Quantity, Parts]:
+    """Return the numbers of each quantity."""
+    values: dict[Quantity, Parts] = {}
+    for (arm, kind), places in sorted(meanings.items()):
+        numbers = table.stacked([place for _, place in sorted(places.items())])
+        if kind.startswith("joint"):
+            values[arm, kind] = (in_mm(numbers),)
+        elif kind.startswith("jaw"):
+            values[arm, kind] = (numbers,)
+        else:  # the recorders write metres
+            values[arm, kind] = (scaled(numbers[:, :3], 1000.0), *([numbers[:, 3:]] if numbers.shape[1] > 3 else []))
+    return values
 
 
 def episode_stamps(files: Files, root: str) -> Ints:
@@ -218,24 +225,24 @@ def _meanings(
             place, names = (feature.name, index), feature.called(index)
             said = (meaning_of(name.removeprefix("action.") if action else name) for name in names)
             meaning = next((one for one in said if one is not None), None)
-            if meaning is None or (action and meaning[1] not in _SETPOINTS):
+            if meaning is None or (action and meaning[1] not in SETPOINTS):
                 nameless += [] if place in taken else [names[0]]
             elif meaning not in stated and place not in taken:
                 arm, kind, component = meaning
                 if found.setdefault((arm, kind), {}).setdefault(component, place) != place:
                     double = f"Two columns of the dataset are called {printable(names[0])}."
-                    if kind not in _SETPOINTS:
+                    if kind not in SETPOINTS:
                         raise BadColumns(double, Remedy(Action.NAME_FEATURES))
                     faults[arm, kind] = double
         if nameless and not action:
             unknown.append((feature.name[:NOTE_CHARACTERS], f"not used: {', '.join(nameless)}"[:NOTE_CHARACTERS]))
-    measured = {quantity: places for quantity, places in found.items() if quantity[1] not in _SETPOINTS}
+    measured = {quantity: places for quantity, places in found.items() if quantity[1] not in SETPOINTS}
     for quantity, places in sorted(measured.items()):
         if why := _incomplete(quantity, places):
             raise BadColumns(why)
-    commanded = {quantity: places for quantity, places in found.items() if quantity[1] in _SETPOINTS}
+    commanded = {quantity: places for quantity, places in found.items() if quantity[1] in SETPOINTS}
     faults |= {quantity: why for quantity, places in commanded.items() if (why := _incomplete(quantity, places))}
-    unknown += [(_topic(*quantity), why) for quantity, why in faults.items()]
+    unknown += [(topic_of(*quantity), why) for quantity, why in faults.items()]
     if not any(kind != "jaw" for _, kind in measured):
         listed = ", ".join(name for one in numeric for name in one.names or [one.name])[:1000]
         raise NoUsableTopic(
@@ -254,7 +261,7 @@ def meaning_of(name: str) -> tuple[str, str, int] | None:
     """Return the arm, the quantity and the component that a column's name stands for; None for any other name."""
     if pose := _POSE.fullmatch(name):
         kind = ("local_" if pose[2] else "") + ("pose" if pose[3].lower() == "pose" else "setpoint")
-        return pose[1].upper(), kind, _POSE_PARTS.index(pose[4].lower())
+        return pose[1].upper(), kind, POSE_PARTS.index(pose[4].lower())
     if joint := _JOINT.fullmatch(name):
         which, kind = joint[3].lower(), "joint_setpoints" if joint[2] else "joints"
         return joint[1].upper(), kind, int(which) - 1 if which.isdecimal() else _JOINT_NAMES.index(which)
@@ -288,21 +295,17 @@ def _incomplete(quantity: Quantity, places: Mapping[int, Place]) -> str | None:
     arm, kind = quantity
     if kind.startswith("jaw"):
         return None
-    names = _JOINT_NAMES if kind.startswith("joint") else _POSE_PARTS
+    names = _JOINT_NAMES if kind.startswith("joint") else POSE_PARTS
     count = 3 if kind in ("pose", "local_pose") and max(places) < 3 else len(names)
     missing = next((names[k] for k in range(count) if k not in places), None)
     return missing and f"The {kind} of {arm} has no column {missing}; all parts are needed."
-
-
-def _topic(arm: str, kind: str) -> str:
-    return _TOPICS[kind].replace("{}", arm)
 
 
 # ---- motions -------------------------------------------------------------------------------------------------------
 
 
 def _motions(
-    values: Mapping[Quantity, Floats],
+    values: Mapping[Quantity, Parts],
     joints: Mapping[str, Joints],
     tools: Mapping[str, str],
     stamps_ns: Ints,
@@ -322,14 +325,16 @@ def _motions(
             if number is None:
                 left_out.append((joints[arm].topic, f"no pose from joints: the instrument of {arm} is not known"))
             else:
-                local = _forward(joints[arm].positions, number)
+                local = pose_of(joints[arm].positions, number)
         if local is not None:
-            motions.append(replace(_motion(arm, "local_pose", base, stamps_ns, local), from_joints=computed))
+            motions.append(replace(pose_motion(arm, "local_pose", base, stamps_ns, local), from_joints=computed))
         if pose is not None and arm in frames:
-            motions.append(_motion(arm, "pose", frames[arm], stamps_ns, pose))
+            motions.append(pose_motion(arm, "pose", frames[arm], stamps_ns, pose))
         elif pose is not None:
-            left_out.append((_topic(arm, "pose"), "the dataset does not say in which frame it is"))
+            left_out.append((topic_of(arm, "pose"), "the dataset does not say in which frame it is"))
     if motions:
+        for motion in motions:
+            check_outside(motion)
         return tuple(motions), left_out
     if any(kind == "pose" for _, kind in values):
         raise BadColumns(
@@ -341,32 +346,6 @@ def _motions(
         f"{', '.join(INSTRUMENTS)}.",
         Remedy(Action.NAME_TOOL),
     )
-
-
-def _setpoints(
-    values: Mapping[Quantity, Floats], motions: Sequence[Motion], tools: Mapping[str, str], stamps_ns: Ints
-) -> ColumnSetpoints:
-    """Return the setpoints beside measured poses in the same frame; those of joints in the base of their arm."""
-    setpoints = ColumnSetpoints()
-    for (arm, kind), found in values.items():
-        topic, pose = _topic(arm, kind), found
-        beside = _topic(arm, "pose" if kind == "setpoint" else "local_pose")
-        measured = next((one for one in motions if one.topic == beside), None)
-        if kind == "jaw_setpoint":
-            setpoints.add_jaw(arm, topic, stamps_ns, found[:, 0])
-            continue
-        if kind == "joint_setpoints":
-            number = _number(tools.get(arm, ""))
-            if (arm, "local_setpoint") in values or number is None or not np.isfinite(found).all():
-                why = "not used: the instrument is not known, a number is NaN or infinite, or poses are there too"
-                setpoints.left_out.append((topic, why))
-                continue
-            topic, pose = _topic(arm, "local_setpoint"), _forward(_in_mm(found), number)
-        if measured is None:
-            setpoints.left_out.append((topic, f"{arm} has no measured pose beside it in a known frame"))
-        else:
-            setpoints.add_tip(topic, stamps_ns, 1000.0 * pose[:, :3], pose[:, 3:], measured)
-    return setpoints
 
 
 def _frames(dataset: Dataset, frame: str | None, arms: Collection[str]) -> dict[str, str]:
@@ -388,32 +367,6 @@ def _frames(dataset: Dataset, frame: str | None, arms: Collection[str]) -> dict[
             frames=sorted(set(frames.values()))[:20],
         )
     return frames | stated
-
-
-def _motion(arm: str, kind: str, frame: str, stamps_ns: Ints, pose: Floats) -> Motion:
-    motion = recorded_motion(
-        arm=arm,
-        topic=_topic(arm, kind),
-        frame=frame,
-        stamps_ns=stamps_ns,
-        tip_mm=1000.0 * pose[:, :3],  # the recorders write metres
-        rotation_xyzw=pose[:, 3:] if pose.shape[1] > 3 else None,
-    )
-    check_outside(motion)
-    return motion
-
-
-def _in_mm(joints: Floats) -> Floats:
-    """Convert the insertion from metres."""
-    scaled = joints.copy()
-    scaled[:, INSERTION] *= 1000.0
-    return scaled
-
-
-def _forward(positions: Floats, instrument: str) -> Floats:
-    """Return the poses of the tip in m, shape (T, 7), from joints in rad and mm, shape (T, 6)."""
-    tip_mm, turned = forward(positions, instrument)
-    return np.concatenate([tip_mm / 1000.0, quaternion_of(turned)], axis=1)
 
 
 def _arms_of_tools(feature: Feature) -> list[str | None]:

@@ -11,7 +11,6 @@ The dataset is complete and verified before videos are added: of v2.1 one file p
 of the folder, with the episodes' times in them. Statistics of the pictures are those of the folder, where it has them.
 """
 
-import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,7 +24,8 @@ import numpy as np
 
 from skills.errors import BadInput, Corrupt
 from skills.formats.archive import Archive
-from skills.formats.lerobot import INFO, MANIFEST, Dataset, Json
+from skills.formats.checksums import SUMS, digest_of, read_sums, write_sums
+from skills.formats.lerobot import INFO, Dataset, Json
 from skills.formats.lerobot.cut import EPISODES, Episode, cut_episode, episodes_of, find_dataset
 from skills.formats.lerobot.episode import episode_stamps
 from skills.formats.lerobot.parquet import open_parquet, printable, read_rows
@@ -43,7 +43,6 @@ _SHARED = re.compile(r"videos/([^/]+)/chunk-(\d{1,9})/file-(\d{1,9})\.mp4")
 _SINGLE = re.compile(r"videos/chunk-\d{1,9}/([^/]+)/episode_(\d{1,9})\.mp4")
 _PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 _PLAIN = ("min", "max", "mean", "std")
-_PIECE = 1 << 20
 _README = "meta/README.md"
 _EPISODE_STATS, _WHOLE_STATS = "meta/episodes_stats.jsonl", "meta/stats.json"
 _PLACES = "meta/episodes/chunk-000/file-000.parquet"
@@ -152,7 +151,7 @@ def _recorded(
     with TemporaryFile() as packed:
         cut_episode(dataset, episode, packed, columns=columns, tools=tools)
         packed.seek(0)
-        digest = hashlib.file_digest(packed, "sha256").hexdigest()
+        digest = digest_of(packed)
         packed.seek(0)
         stamps_ns = episode_stamps(Archive(packed), "")
     even_ns = np.arange(len(stamps_ns)) * (1e9 / dataset.fps)
@@ -409,7 +408,7 @@ def add_videos(folder: Path, videos: Videos) -> None:
         BadInput: An episode has other frames than its video, or a camera is called like another feature.
         Corrupt: A video has changed since it was checked, or the dataset is not as this version writes it.
     """
-    sums = {line[66:]: line[:64] for line in (folder / MANIFEST).read_text().splitlines()}
+    sums = read_sums((folder / SUMS).read_text())
     info = json.loads((folder / INFO).read_text())
     if taken := videos.cameras.keys() & info["features"].keys():
         raise BadInput(f"The camera {sorted(taken)[0]} is called like another feature of the dataset; rename it.")
@@ -424,7 +423,7 @@ def add_videos(folder: Path, videos: Videos) -> None:
     if readme.count(NO_PICTURES) != 1:
         raise Corrupt("The README of the dataset has no sentence about pictures; update the command or the service.")
     _write(folder, _README, readme.replace(NO_PICTURES, _words(videos)), sums)
-    (folder / MANIFEST).write_text("".join(f"{sums[name]}  {name}\n" for name in sorted(sums)))
+    (folder / SUMS).write_bytes(write_sums(sums))
 
 
 def _words(videos: Videos) -> str:
@@ -478,7 +477,7 @@ def _complete_shared(folder: Path, videos: Videos, sums: dict[str, str]) -> None
         for name, values in columns.items():
             table = table.append_column(name, pa.array(values))
     parquet.write_table(table, folder / _PLACES)
-    sums[_PLACES] = _digest(folder / _PLACES)
+    _add_sum(folder, _PLACES, sums)
     whole = json.loads((folder / _WHOLE_STATS).read_text())
     whole |= {camera: _nested(reduce(joined_stats, stats)) for camera, stats in videos.stats.items()}
     _write(folder, _WHOLE_STATS, json.dumps(whole, indent=4, ensure_ascii=False, allow_nan=False), sums)
@@ -508,22 +507,18 @@ def _nested(stats: Stats) -> dict[str, list[Any]]:
 def _copy(folder: Path, name: str, path: Path, videos: Videos, sums: dict[str, str]) -> None:
     to = folder / name
     to.parent.mkdir(parents=True, exist_ok=True)
-    seen = hashlib.sha256()
     with path.open("rb") as file, to.open("x+b") as out:
-        while data := file.read(_PIECE):
-            seen.update(data)
-            out.write(data)
+        sums[name] = digest_of(file, out.write)
         header, checked = read_mp4(out, str(path)), videos.headers[path]
     if not (np.array_equal(header.times_s, checked.times_s) and header.format == checked.format):
         raise Corrupt(f"{path} has changed while it was copied. Export again.")
-    sums[name] = seen.hexdigest()
 
 
 def _write(folder: Path, name: str, text: str, sums: dict[str, str]) -> None:
     (folder / name).write_text(text)
-    sums[name] = _digest(folder / name)
+    _add_sum(folder, name, sums)
 
 
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _add_sum(folder: Path, name: str, sums: dict[str, str]) -> None:
+    with (folder / name).open("rb") as file:
+        sums[name] = digest_of(file)

@@ -18,21 +18,24 @@ those of all values; quantiles of the dataset are the means of the episodes', we
 them.
 """
 
-import hashlib
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from tempfile import TemporaryFile
 from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
+from jinja2 import Template
 from numpy.typing import NDArray
 
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
-from skills.formats.lerobot import INFO, MANIFEST, SAID, TASK_LINES, TASK_TABLE, Json
+from skills.formats.checksums import SUMS, digest_of, write_sums
+from skills.formats.columns import POSE_PARTS
+from skills.formats.lerobot import INFO, SAID, TASK_LINES, TASK_TABLE, Json
 
 Version = Literal["v2.1", "v3.0"]
 ActionRule = Literal["next state", "setpoint"]
@@ -43,7 +46,6 @@ CHUNK = 1000  # episodes or files in a folder
 FILE_BYTES = 32 << 20  # of numbers in a data file of v3.0
 FILE_EPISODES = 1000  # in it at most, for the places of their row groups are in memory until it ends
 TABLE_ROWS = 100  # episodes that are written to the table of v3.0 together, since its columns are many
-PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 NO_PICTURES = "There are no pictures."  # in the README, where `skills.formats.lerobot.videos` names the cameras instead
 
@@ -54,7 +56,6 @@ _ACTIONS: dict[ActionRule, str] = {
     "next state": "`action` is the state of the next frame.",
     "setpoint": "`action` has the setpoints of these poses and jaws that are nearest in time, in the same frames.",
 }
-_PIECE = 1 << 20
 
 Singles = NDArray[np.float32]
 Numbers = NDArray[Any]
@@ -118,7 +119,9 @@ class AboutDataset:
     def names(self) -> list[str]:
         """The names of the state's numbers."""
         return [
-            name for arm in map(str.lower, self.arms) for name in (*(f"{arm}_pose.{p}" for p in PARTS), f"{arm}_jaw")
+            name
+            for arm in map(str.lower, self.arms)
+            for name in (*(f"{arm}_pose.{p}" for p in POSE_PARTS), f"{arm}_jaw")
         ]
 
     @property
@@ -173,13 +176,10 @@ def dataset_files(
     seen: dict[str, str] = {}
     for name, file in _files(episodes, about, version):
         file.seek(0)
-        digest = hashlib.sha256()
-        while data := file.read(_PIECE):
-            digest.update(data)
-        seen[name] = digest.hexdigest()
+        seen[name] = digest_of(file)
         file.seek(0)
         yield name, file
-    yield MANIFEST, io.BytesIO("".join(f"{seen[name]}  {name}\n" for name in sorted(seen)).encode())
+    yield SUMS, io.BytesIO(write_sums(seen))
 
 
 def _files(
@@ -598,39 +598,6 @@ def _line(value: object) -> bytes:
 
 def _readme(about: AboutDataset, total: _Total) -> str:
     """Return the README of a dataset, with the sections that Open-H asks for."""
-    frames = "".join(f"- {arm}: `{frame}`\n" for arm, frame in total.frames.items())
-    splits = "".join(f"- {split}: episodes {a} to {b - 1}\n" for split, (a, b) in total.splits.items())
-    tasks = "".join(f"- {task}\n" for task in total.tasks)
-    return f"""# {about.name}
-
-Licence: {about.licence}. Consent: {about.consent}
-
-## Dataset Description
-
-{about.description}
-
-{total.episodes} episodes, {total.rows} frames at {about.fps} Hz. Tasks:
-
-{tasks}
-Splits, by {about.split_by}:
-
-{splits}
-## Collection Procedure
-
-{about.procedure}
-
-## Robot
-
-da Vinci Research Kit. `observation.state` has the measured pose and jaw of {", ".join(about.arms)}, in metres, unit
-quaternions x, y, z, w, and radians. {_ACTIONS[about.action]} The frames of the poses:
-
-{frames}
-## Sensors
-
-The arms' encoders. {NO_PICTURES}
-
-## Synchronization
-
-For each frame the recorded sample of each arm and jaw that is nearest in time, at most {1000 / about.fps:.1f} ms from
-it; nothing is interpolated.
-"""
+    template = Template((files("skills.formats.lerobot") / "README.md.jinja").read_text(), autoescape=False)
+    text = template.render(about=about, total=total, action=_ACTIONS[about.action], no_pictures=NO_PICTURES)
+    return f"{text}\n"
