@@ -14,14 +14,28 @@ from starlette.middleware.errors import ServerErrorMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skills import __version__
-from skills.api.authentication import Access, Gate
+from skills.api.authentication import Access
+from skills.api.encoded_policies import Encoded
+from skills.api.gate import Gate
+from skills.api.job_events import Watching
 from skills.api.metrics import Observed, ServiceMetrics
 from skills.api.openapi import complete
 from skills.api.policy_cache import CachedPolicyMiddleware, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
-from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import comparison, datasets, demos, operating, pages, people, plans, policies, recordings
+from skills.api.routes import (
+    comparison,
+    datasets,
+    demos,
+    operating,
+    pages,
+    people,
+    plans,
+    policies,
+    recordings,
+    sign_in,
+)
 from skills.api.sessions import Sessions
+from skills.api.streams import DOWNLOADS_READ
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
 from skills.jobs import Engine
@@ -112,7 +126,7 @@ def create_app(settings: Settings) -> FastAPI:
         recordings.page_router,
         comparison.page_router,
         plans.timeline_page_router,
-        operating.sign_in_router,
+        sign_in.sign_in_router,
         people.key_router,
     ):
         app.router.routes.extend(router.routes)

@@ -18,7 +18,8 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skills.api.authorisation import Needs
-from skills.api.responses import KEPT_BYTES, Body, Encoded, answer, negotiate
+from skills.api.encoded_policies import KEPT_BYTES, Encoded, negotiate
+from skills.api.responses import Body, answer
 from skills.db.changes import Unasked, WeightedCache, changes_of
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError, UnknownFormat

@@ -33,10 +33,10 @@ from sqlalchemy.orm import aliased
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from skills.api.authentication import Bucket
 from skills.api.authorisation import Caller
-from skills.api.dependencies import strictly_read
+from skills.api.rate_limits import Bucket
 from skills.api.responses import json_of
+from skills.api.strict_json import strictly_read
 from skills.db.changes import Changes, Unasked
 from skills.db.models import PolicyVersion, Release, Surgeon
 from skills.db.session import Database

@@ -198,13 +198,13 @@ def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
 
 def _listed_in(given: list[str] | None) -> tuple[list[str], "Erasures"]:
     """Return the lists of erasures to apply, by default the file of the settings, and their union."""
-    from skills.library.operation import backup as library
+    from skills.library.operation.erasure_list import NOTHING, read_erasures
     from skills.settings import settings
 
-    kept, listed = settings().erasures_file, library.NOTHING
+    kept, listed = settings().erasures_file, NOTHING
     sources = given or ([str(kept)] if kept is not None and kept.exists() else [])
     for one in sources:
-        listed |= library.read_erasures(one)
+        listed |= read_erasures(one)
     return sources, listed
 
 
@@ -227,7 +227,7 @@ def erasures(
 ) -> None:
     """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`."""
     from skills.db.session import Database
-    from skills.library.operation.backup import keep_erasures
+    from skills.library.operation.erasure_list import keep_erasures
     from skills.settings import settings
 
     with closing(Database(settings().database_url)) as database, files():
@@ -419,7 +419,7 @@ def _telling(doing: str) -> Iterator[Callable[[str], None]]:
 
 if TYPE_CHECKING:
     from skills.db.session import Database
-    from skills.library.operation.backup import Erasures
+    from skills.library.operation.erasure_list import Erasures
     from skills.library.operation.inspection import Checked
 
 key_commands = typer.Typer()
@@ -488,7 +488,7 @@ def _database() -> Iterator["Database"]:
         database.migrate()
         yield database
         if (file := settings().erasures_file) is not None:
-            from skills.library.operation.backup import keep_up_erasures
+            from skills.library.operation.erasure_list import keep_up_erasures
 
             keep_up_erasures(database, file)
 

@@ -1,48 +1,32 @@
-"""Readiness of an installation: checks of its databases and workers, and the warm-up of the compiled loops.
+"""Readiness of an installation: checks of its databases and workers.
 
 There must be a usable database, the one that was signed last with this signing key, a usable database of the job
 engine, and at least one live worker. Each check uses new connections with a short timeout, so that the result is
-current and arrives in time. After the warm-up, the first job or request does not wait for compilation.
+current and arrives in time.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from datetime import datetime, timedelta
 from pathlib import Path
-from threading import Thread
 
-import numpy as np
 from sqlalchemy import select, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
-from skills.compiled import cache_folders, check_cache_folder, make_ready
 from skills.db import now
 from skills.db.models import SutureType
 from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import Executor
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
-from skills.gridworld.grid import GridPath, GridWorld
-from skills.gridworld.reward import sparse_reward
-from skills.learning.certificate import certify
-from skills.learning.evaluation import dtw, measure
-from skills.learning.policy import learn_tabular, rollout_from
-from skills.learning.pose_style import PosePath
-from skills.learning.q_learning import PhaseQLearning
-from skills.learning.tube import certify_tube, next_pose
-from skills.learning.tube_certificate import TubeLimits
-from skills.packing import palette_of
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 
 PATIENCE_MS = 2000  # of each connection; a health check must answer soon
 LOOK_S = 0.1  # between two looks at the heartbeats
 UNUSABLE = "The database cannot be read and written; check it, its disk and its server."
-TWO_CELLS = GridPath(GridWorld((0.0, 0.0, 0.0), 1.0, (1, 1, 2)), np.array([0, 1]))
-STILL = np.zeros(2)
-TWO_POSES = PosePath(np.eye(2, 3), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.array([0.0, 1.0]), None, STILL, STILL)
 
 
 def refuse_unready(settings: Settings) -> int:
@@ -139,52 +123,3 @@ def _beats(database: Database) -> Mapping[str, datetime]:
             return {one.id: one.beat_at for one in session.execute(select(Executor.id, Executor.beat_at))}
     except (SkillsError, SQLAlchemyError) as error:
         raise NotReady("The database cannot be read; check it, its disk and its server.") from error
-
-
-# ---- warm-up of the compiled loops ---------------------------------------------------------------------------------
-
-
-def warm_up(work: Callable[[], object]) -> Thread:
-    """Run `work` once in a background thread, so that the functions it calls are compiled or loaded.
-
-    The reader's loops are prepared in the process that runs them, the fork server (`skills.formats.reader_process`);
-    their cache folder is checked here too, so that a process which would refuse it later does not start.
-
-    Args:
-        work: Callback that calls the compiled loops with small inputs.
-
-    Returns:
-        The thread.
-
-    Raises:
-        BadSettings: Machine code would be loaded from a folder that other users can write to; see `check_cache_folder`.
-    """
-    for folder in cache_folders():
-        check_cache_folder(folder)
-    # Not a daemon thread: the interpreter's shutdown must not kill it while it compiles.
-    warming = Thread(target=make_ready, args=(work,), name="warm-up")
-    warming.start()
-    return warming
-
-
-def learn_once() -> None:
-    """Learn a policy of the shortest possible path.
-
-    A job calls the same functions.
-    """
-    policy = learn_tabular(sparse_reward(TWO_CELLS), PhaseQLearning())
-    certify(policy)
-    measure(rollout_from(policy, TWO_CELLS.start))
-    palette_of(policy.q)
-    certify_tube(TWO_POSES, TubeLimits())
-    align_once()
-
-
-def align_once() -> None:
-    """Align the shortest possible path with its reverse, compute a palette, and follow two poses.
-
-    A request calls the same functions.
-    """
-    dtw(TWO_CELLS.tip_mm, TWO_CELLS.tip_mm[::-1])
-    palette_of(TWO_CELLS.tip_mm)
-    next_pose(TWO_POSES, TWO_POSES.tip_mm[0], TWO_POSES.rotation_xyzw[0], None, TubeLimits())

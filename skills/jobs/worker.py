@@ -31,7 +31,8 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import SkillsError
 from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
-from skills.jobs.workflows import Leases, Perform, Watch, Work, register
+from skills.jobs.watch import Leases, Watch
+from skills.jobs.workflows import Perform, Work, register
 from skills.library.operation.sweep import SteadyClock, sweep
 from skills.logs import job_id, told
 from skills.sandbox.forked import refuse_uncontained
@@ -174,7 +175,7 @@ def _keep_verified(watch: Watch, every_s: float) -> None:
 
 def _library() -> Perform:
     """Return the library's `perform_job`, and start the warm-up for it."""
-    from skills.jobs.readiness import learn_once, warm_up  # imported late, because they import everything else
+    from skills.jobs.warm_up import learn_once, warm_up
     from skills.library.perform import perform_job
 
     warm_up(learn_once)

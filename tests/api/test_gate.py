@@ -15,7 +15,8 @@ import pytest
 from sqlalchemy import event, text
 
 from skills.api.app import ALWAYS
-from skills.api.authentication import BAD_AT_ONCE, COOKIE, PROXY_SECRET, Bucket, Gate
+from skills.api.gate import COOKIE, PROXY_SECRET, Gate
+from skills.api.rate_limits import BAD_AT_ONCE, Bucket
 from skills.library.people.keys import revoke_key
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key, routes

@@ -12,7 +12,8 @@ from skills.db.leaves import CHECKPOINTS
 from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.errors import Conflict, NotReady
-from skills.library.operation.backup import accept_rollback, back_up, erasures_of, restore
+from skills.library.operation.backup import accept_rollback, back_up, restore
+from skills.library.operation.erasure_list import erasures_of
 from skills.library.operation.history import Verified, sign_history, sign_some_history, verify_history
 from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw

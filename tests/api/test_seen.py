@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from skills.api.authentication import is_open
+from skills.api.gate import is_open
 from skills.db import Base
 from skills.db.row_visibility import UNRESTRICTED_TABLES, Only
 from skills.db.service_tables import Job

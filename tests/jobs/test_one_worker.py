@@ -12,7 +12,7 @@ from sqlalchemy import inspect, text
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.jobs import STEPS, WORKFLOW, connect, drop, workflow_id
-from skills.jobs.workflows import ENGINE_ATTEMPTS, Leases, Watch
+from skills.jobs.watch import ENGINE_ATTEMPTS, Leases, Watch
 from skills.settings import Settings
 from tests.jobs.house import House
 from tests.waiting import until

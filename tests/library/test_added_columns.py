@@ -15,7 +15,8 @@ from skills.db.leaves import LEAVES, latest_leaves
 from skills.db.logged_rows import ADDED, Logged, logged
 from skills.db.revisions import revisions, upgrade
 from skills.db.session import Database
-from skills.library.operation.backup import NOTHING, back_up, restore
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import NOTHING
 from skills.library.operation.history import newest_checkpoint, sign_history
 from skills.library.operation.proofs import head_over, served_json
 from tests import backends

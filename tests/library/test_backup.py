@@ -14,14 +14,8 @@ from skills.db.models import Demonstration, Erasure, Surgeon
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt, Erased
-from skills.library.operation.backup import (
-    Erasures,
-    back_up,
-    erasures_of,
-    keep_erasures,
-    read_erasures,
-    restore,
-)
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import Erasures, erasures_of, keep_erasures, read_erasures
 from skills.library.operation.inspection import inspect_installation
 from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon

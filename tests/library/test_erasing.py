@@ -19,7 +19,8 @@ from skills.library.comparison import atlas
 from skills.library.comparison.atlas import atlas_of
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.operation import sweep
-from skills.library.operation.backup import back_up, erasures_of, keep_up_erasures, read_erasures, restore
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import erasures_of, keep_up_erasures, read_erasures
 from skills.library.operation.sweep import sweep_erased
 from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon

@@ -31,7 +31,8 @@ from skills.db.session import Database
 from skills.errors import NotFound, SkillsError
 from skills.jobs.workflows import Work
 from skills.library.comparison.atlas import atlas_of
-from skills.library.operation.backup import accept_rollback, back_up, keep_erasures, read_erasures, restore
+from skills.library.operation.backup import accept_rollback, back_up, restore
+from skills.library.operation.erasure_list import keep_erasures, read_erasures
 from skills.library.operation.history import Verified, sign_history, verify_history
 from skills.library.operation.jobs import BATCH, PART
 from skills.library.perform import perform_job

@@ -26,7 +26,7 @@ from markupsafe import Markup
 from skills.api.authorisation import Caller, Role
 from skills.errors import UnknownFormat
 from skills.formats import READABLE
-from skills.library.operation.overview import StyleState
+from skills.library.operation.styles import StyleState
 from skills.library.plans.playbacks import error_called
 
 HTML = "text/html"

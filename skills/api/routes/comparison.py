@@ -9,26 +9,18 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import (
-    Db,
-    Digest,
-    Slug,
-    Strict,
-    Tell,
-)
+from skills.api.dependencies import Db, Digest, Slug, Tell
 from skills.api.openapi import gives, router_of, says
 from skills.api.pages import drawings, render
-from skills.api.responses import (
-    Giving,
-    say,
-)
+from skills.api.responses import Giving, say
 from skills.api.routes.pages import PageRoute, Picked
+from skills.api.strict_json import Strict
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.comparison import scores
 from skills.library.comparison.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.comparison.recognition import recognise_recording
-from skills.library.operation import overview
+from skills.library.operation import styles
 from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
 from skills.schemas.requests import COUNT, DIGEST, SLUG
@@ -188,8 +180,8 @@ def show_surgeon(
     """Show a surgeon over time: the demonstrations of a suture type, session by session, beside a style's reference."""
     with db.reading() as session:
         found = find_surgeon(session, surgeon)
-        styles = [style for style in overview.styles_of(session, found) if style.demos]
-        chosen = suture or next((style.suture for style in styles), None)
+        listed = [style for style in styles.styles_of(session, found) if style.demos]
+        chosen = suture or next((style.suture for style in listed), None)
         others = scores.references(session, chosen) if chosen else []
     compared = against or next((one.slug for one in others if one.slug != surgeon), surgeon)
     shown, refused = None, ""
@@ -203,7 +195,7 @@ def show_surgeon(
         "surgeon.html",
         caller,
         surgeon=found,
-        styles=styles,
+        styles=listed,
         asked={"suture": chosen, "against": compared},
         others=others,
         shown=shown,

@@ -12,13 +12,13 @@ from sqlalchemy.orm import Session
 from skills import errors
 from skills.api.authorisation import Asking, needs, open_to_all
 from skills.api.dependencies import Configured, Db, Digest, Limit, RowCursor, Slug, SlugCursor, Tell
+from skills.api.encoded_policies import JSON
 from skills.api.pages import assets, build, drawings, render
-from skills.api.responses import JSON
 from skills.api.routes.policies import JobId, Version
 from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library.comparison import scores
-from skills.library.operation import jobs, overview
+from skills.library.operation import jobs, overview, styles, views
 from skills.library.people.catalogue import list_surgeons
 from skills.library.plans.plans import find_plan, followed_plan, hands_over, plan_in_words
 from skills.library.plans.playbacks import headline_of
@@ -99,9 +99,9 @@ def show_catalogue(
 ) -> Response:
     """Show the styles: surgeons and suture types, with their stored, trained and released state."""
     with db.reading() as session:
-        found = overview.matrix(session, q, state or None, skill or None, cursor)
+        found = styles.matrix(session, q, state or None, skill or None, cursor)
         asked = {"q": q, "state": state, "skill": skill}
-        known: dict[str, Any] = {"sutures": overview.all_suture_types(session), "most_counted": overview.MOST_COUNTED}
+        known: dict[str, Any] = {"sutures": overview.all_suture_types(session), "most_counted": styles.MOST_COUNTED}
         return render(request, "catalogue.html", caller, found=found, asked=asked, **known)
 
 
@@ -117,14 +117,14 @@ def show_style(
 ) -> Response:
     """Show a style in 3-D, with its figures, versions and demonstrations; `beside` is a version to compare with."""
     with db.reading() as session:
-        whole = overview.whole_style(session, surgeon, suture)
+        whole = styles.whole_style(session, surgeon, suture)
         shown = _chosen(session, whole, version)
         other = None if beside is None else versions.find_version(session, surgeon, suture, beside)
         most = overview.MOST_LISTED
         return render(request, "style.html", caller, whole=whole, shown=shown, other=other, most=most)
 
 
-def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -> Any:
+def _chosen(session: Session, whole: styles.WholeStyle, version: int | None) -> Any:
     """Return the version to show: the requested one, else the served one, else the newest."""
     if version is not None:
         return versions.find_version(session, whole.surgeon.slug, whole.suture.slug, version)
@@ -137,14 +137,14 @@ def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -
 def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, db: Db) -> Response:
     """Return the data of a version's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_version(versions.choose(session, surgeon, suture, version)))
+        return _json(views.view_of_version(versions.choose(session, surgeon, suture, version)))
 
 
 @router.get("/pages/demos/{demo}/view", dependencies=[needs("reader")])
 def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
     """Return the data of a demonstration's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_demo(session, shown_demo(session, demo)))
+        return _json(views.view_of_demo(session, shown_demo(session, demo)))
 
 
 @router.get("/pages/demos/{demo}/score", dependencies=[needs("reader")])
@@ -225,7 +225,7 @@ def show_recording(
 @router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
 def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Tell) -> Response:
     """Return the data of a recording's timeline."""
-    return _json(overview.traces_of(db, recording, tell))
+    return _json(views.traces_of(db, recording, tell))
 
 
 @router.get("/pages/plans", dependencies=[needs("reader")])
@@ -255,7 +255,7 @@ def show_plan_editor(
         if before is not None:
             surgeon, suture = before.policy.surgeon.slug, before.policy.suture
             version = before.policy.version
-        released = overview.released_styles(session)
+        released = styles.released_styles(session)
         policy = None
         if surgeon is not None and suture is not None:
             policy = versions.choose(session, surgeon, suture, version)

@@ -13,39 +13,17 @@ from fastapi import Header, Path, Query, Request, Response, WebSocket
 from sqlalchemy.orm import Session
 
 from skills.api.authorisation import Asking, needs, refuse_release
-from skills.api.dependencies import (
-    Actor,
-    Configured,
-    Db,
-    Digest,
-    Jobs,
-    Limit,
-    RowCursor,
-    Slug,
-    Strict,
-    room_for_a_job,
-)
+from skills.api.dependencies import Actor, Configured, Db, Digest, Jobs, Limit, RowCursor, Slug, room_for_a_job
+from skills.api.encoded_policies import JSON, NPZ, Encoded, negotiate
+from skills.api.job_events import Watching
 from skills.api.openapi import ends, gives, gives_page, gives_stream, router_of, says, starts_job
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import card_page
 from skills.api.policy_cache import POSES, SIGNATURE, PolicyCache
-from skills.api.responses import (
-    JSON,
-    NPZ,
-    Condition,
-    Encoded,
-    Giving,
-    Stream,
-    Watching,
-    accepted,
-    answer,
-    json_of,
-    names,
-    negotiate,
-    say,
-    tag_of,
-)
+from skills.api.responses import Condition, Giving, accepted, answer, json_of, names, say, tag_of
 from skills.api.sessions import Sessions
+from skills.api.streams import Stream
+from skills.api.strict_json import Strict
 from skills.db.models import PolicyVersion
 from skills.db.session import Database
 from skills.errors import PreconditionFailed
