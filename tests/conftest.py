@@ -56,9 +56,7 @@ def compile_loops() -> None:
             continue
         cached = [file.stat().st_mtime for file in module.parent.glob(f"__pycache__/{module.stem}.*.nbi")]
         if not cached or min(cached) < module.stat().st_mtime:
-            code = (
-                "import skills.jobs.readiness as w, skills.formats.reader_process as c; w.learn_once(); c.get_ready()"
-            )
+            code = "import skills.jobs.warm_up as w, skills.formats.reader_process as c; w.learn_once(); c.get_ready()"
             subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
             return
 

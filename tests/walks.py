@@ -44,7 +44,7 @@ PERIODIC = ("forget_erased", "forget_gone", "_sweep", "is_right")  # part of no 
 STARTING = ("confined_reader", "stated_errors", "migrate", "seed_catalogue", "create_app")  # called once by the service
 # Numbers, bytes and words: a reader knows them after the first page, and stays in the room that calls them.
 TOOLS = ("arrays.py", "arithmetic.py", "quaternions.py", "kinematics.py", "compiled.py", "packing.py", "fields.py")
-TOOLS += ("errors.py", "remedies.py", "settings.py", "logs.py", "transparency.py", "transparency")
+TOOLS += ("errors.py", "remedies.py", "settings.py", "logs.py", "transparency")
 
 
 def room(file: str) -> str:

@@ -143,7 +143,7 @@ def restore(
     That is, erasures, withdrawals, revoked keys and narrowed consents, from the lists of --erasures.
     """
     from skills.db.session import Database
-    from skills.jobs.readiness import refuse_left_over
+    from skills.jobs import refuse_left_over
     from skills.library.operation import backup as library
     from skills.settings import settings
 
@@ -179,7 +179,7 @@ def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
     history are set aside. Restore the right copy instead where there is one.
     """
     from skills.db.session import Database
-    from skills.jobs.readiness import refuse_left_over
+    from skills.jobs import refuse_left_over
     from skills.library.operation import backup as library
     from skills.settings import settings
 

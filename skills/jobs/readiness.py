@@ -11,7 +11,7 @@ from contextlib import closing
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from sqlalchemy import select, text
+from sqlalchemy import select
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -21,6 +21,7 @@ from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import Executor
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
+from skills.jobs import select_a_workflow
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 
@@ -45,26 +46,6 @@ def refuse_unready(settings: Settings) -> int:
         database.compare_history()
         _try_engine(settings)
         return _workers(database, settings.lease_s)
-
-
-def refuse_left_over(settings: Settings) -> None:
-    """Refuse a job engine whose tables belong to another state of the database, for example from before a restore.
-
-    Its workflows refer to jobs by row numbers, which mean other jobs there.
-
-    Raises:
-        NotReady: The engine has such tables, or its database cannot be read.
-    """
-    engine = make_url(settings.engine_url)
-    if engine.get_backend_name() == "sqlite":
-        if engine.database and Path(engine.database).exists():
-            raise NotReady(
-                f"{engine.database} is the job engine's database for another state of this database; move it away."
-            )
-        return
-    with closing(Database(settings.engine_url, patience_ms=PATIENCE_MS)) as database, database.reading() as session:
-        if session.scalar(text("SELECT to_regclass('dbos.workflow_status')")) is not None:
-            raise NotReady("The schema `dbos` is the job engine's schema for another state of this database; drop it.")
 
 
 def _refuse_missing(url: str, what: str) -> None:
@@ -94,8 +75,7 @@ def _try_engine(settings: Settings) -> None:
     _refuse_missing(settings.engine_url, "The job engine's database")
     try:
         with closing(Database(settings.engine_url, patience_ms=PATIENCE_MS)) as engine, engine.writing(()) as session:
-            table = "workflow_status" if session.connection().dialect.name == "sqlite" else "dbos.workflow_status"
-            session.execute(text(f"SELECT 1 FROM {table} LIMIT 1"))  # noqa: S608 - one of two names of ours
+            session.execute(select_a_workflow(session.connection().dialect.name))
     except (SkillsError, SQLAlchemyError) as error:
         raise NotReady("The job engine's database cannot be used; check it, and start a worker.") from error
 

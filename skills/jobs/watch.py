@@ -18,7 +18,7 @@ from sqlalchemy import delete, func, select, update
 from skills.db import now
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
-from skills.jobs import JOBS, QUEUES, STEPS, drop, tell, workflow_id
+from skills.jobs import JOBS, QUEUES, STEPS, cancel, submit, workflow_id
 from skills.jobs.workflows import fail
 from skills.library.operation import locks
 from skills.library.operation.history import NAMED, Verified, sign_some_history, verify_history
@@ -161,7 +161,7 @@ class Watch:
         for job in live:
             workflow = known.get(job.workflow)
             if workflow is None:
-                tell(self._client, job.row, job.attempt, job.kind)
+                submit(self._client, job.row, job.attempt, job.kind)
             elif workflow.status in ENDINGS:
                 state, reason = ENDINGS[workflow.status]
                 fail(self._database, job.row, job.attempt, reason, state)
@@ -295,7 +295,7 @@ class Watch:
         with self._database.writing([locks.job(row)]) as session:
             mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
             session.execute(update(Job).where(*mine).values(**again))
-        drop(self._client, row, attempt)
+        cancel(self._client, row, attempt)
 
     def _begin_again(self, job: Live) -> None:
         """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`."""

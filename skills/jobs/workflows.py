@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from threading import Thread
 
 from dbos import DBOS
 from sqlalchemy import func, update
@@ -18,12 +19,13 @@ from skills.db import now
 from skills.db.service_tables import LONGEST_REASON, Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
-from skills.jobs import WORKFLOW, workflow_id
+from skills.jobs import POLLING_S, QUEUES, WORKFLOW, configuration, workflow_id
 from skills.library.operation import locks
 from skills.library.operation.jobs import ACTIVE, PART, end_part, names_of
 from skills.settings import Settings
 
 FIRST_PAUSE_S = 0.2
+BEAT_S = 0.5  # between two heartbeats while the engine is drained
 log = logging.getLogger(__name__)
 Perform = Callable[[Database, int, int, Settings], None]
 
@@ -137,3 +139,33 @@ def register(work: Work) -> None:
 
 
 log = logging.getLogger(__name__)
+
+
+def recover_workflows(executors: list[str]) -> None:
+    """Return the pending workflows of dead executors to their queues, if they are still theirs."""
+    DBOS._recover_pending_workflows(executors)
+
+
+@contextmanager
+def engine_of(work: Work, executor: str, patience_s: Callable[[], int], beat: Callable[[], object]) -> Iterator[None]:
+    """Run the engine for the duration of the block, then drain it: running jobs may finish, new ones are not taken.
+
+    Args:
+        work: What performs the jobs.
+        executor: The id of this worker in the engine.
+        patience_s: Returns the timeout of draining in seconds.
+        beat: Writes a heartbeat; without it others would take over the jobs that are being finished.
+    """
+    register(work)
+    DBOS(config=configuration(work.settings, executor))
+    DBOS.launch()
+    for queue, at_once in QUEUES.items():
+        DBOS.register_queue(queue, worker_concurrency=at_once, polling_interval_sec=POLLING_S[queue])
+    try:
+        yield
+    finally:
+        drain = Thread(target=DBOS.destroy, kwargs={"workflow_completion_timeout_sec": patience_s()})
+        drain.start()
+        while drain.is_alive():
+            beat()
+            drain.join(BEAT_S)

@@ -34,7 +34,7 @@ def export_dataset(body: DatasetIn, db: Db, jobs: Jobs, actor: Actor) -> Respons
         answer = accepted(session, job, QUEUED if new else did_nothing(job))
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
-        jobs.tell(job.row, job.attempt, job.kind)
+        jobs.submit(job.row, job.attempt, job.kind)
     return answer
 
 

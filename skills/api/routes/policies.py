@@ -31,7 +31,7 @@ from skills.learning.policy import next_step
 from skills.library.operation import jobs as asked
 from skills.library.operation import locks
 from skills.library.operation.integrity import learnt
-from skills.library.operation.jobs import PART, count, job_json, to_tell
+from skills.library.operation.jobs import PART, attempts_to_submit, count, job_json
 from skills.library.operation.proofs import head_over, sign_files
 from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.plans.tries import request_try
@@ -78,7 +78,7 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, se
         answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
-        jobs.tell(job.row, job.attempt, job.kind)
+        jobs.submit(job.row, job.attempt, job.kind)
     return answer
 
 
@@ -94,7 +94,7 @@ def try_recording(body: TryIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking)
         job, new, did = request_try(session, body, actor)
         answer = accepted(session, job, did)
     if new:
-        jobs.tell(job.row, job.attempt, job.kind)
+        jobs.submit(job.row, job.attempt, job.kind)
     return answer
 
 
@@ -136,7 +136,7 @@ def cancel_job(job: JobId, db: Db, jobs: Jobs, actor: Actor) -> Response:
         row = asked.find_job(session, job).row
     with db.writing([locks.job(row)]) as session:
         cancelled = asked.cancel(session, job, actor)
-        told = to_tell(session, cancelled)
+        told = attempts_to_submit(session, cancelled)
         said = job_json(cancelled, outcomes_of(session, [cancelled])[cancelled.row])
     for row, attempt in told:
         jobs.cancel(row, attempt)
@@ -162,10 +162,10 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
     refuse_release(caller, body.release)
     job, new, did = request_retraining(db, body, actor, near_limits(settings), odds_limits(settings))
     with db.reading() as session:
-        told = to_tell(session, job) if new else []
+        told = attempts_to_submit(session, job) if new else []
         answer = accepted(session, job, did)
     for row, attempt in told:
-        jobs.tell(row, attempt, PART)
+        jobs.submit(row, attempt, PART)
     return answer
 
 

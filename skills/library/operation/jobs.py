@@ -40,7 +40,7 @@ UNSYNCHRONISED: Any = {"execution_options": {"synchronize_session": False}}
 Rows = Sequence[int] | Select[int]  # at most as many as a statement may have parameters, or a query
 
 
-def to_tell(session: Session, job: Job) -> list[tuple[int, int]]:
+def attempts_to_submit(session: Session, job: Job) -> list[tuple[int, int]]:
     """List the rows and attempts to submit to the engine for a job: its own, or those of a batch's parts."""
     if job.kind != BATCH:
         return [(job.row, job.attempt)]
@@ -291,7 +291,7 @@ def while_running(database: Database, row: int, attempt: int) -> Database:
     return database.on_condition(check, [locks.job(row)] if names is None else names)
 
 
-def telling(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
+def progress_callback(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
     """Return a callback that stores the progress of a running job, in the database of `while_running`."""
     mine = (Job.identity == identity_of(kind, request), Job.state == "running")
 
