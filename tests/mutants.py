@@ -412,7 +412,8 @@ GUARDS = (
     ),
     Guard("skills/library/policies/relearning.py", 16, ("tests/library/test_relearning.py",)),
     Guard(
-        "skills/library/operation/erasure_list.py", 20, ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
+        "skills/library/operation/erasure_list.py", 20,
+        ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
         ("Erasures", "_latest", "_knows", "_later", "_listed", "_in_order", "_end_again", "_mark_again", "_here",
          "_narrow", "_both"),
     ),

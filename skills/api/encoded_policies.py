@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import orjson
 
-from skills.api.responses import Body, tag_of
+from skills.api.responses import JSON, Body, tag_of
 from skills.db.changes import WeightedCache
 from skills.db.history import History
 from skills.db.models import PolicyVersion, Release
@@ -17,7 +17,7 @@ from skills.library.policies.versions import Served, has_poses, pose_style_json,
 from skills.settings import MEBIBYTE
 from skills.transparency.notes import Note
 
-JSON, NPZ = "application/json", "application/x-npz"
+NPZ = "application/x-npz"
 GIVEN_FOR = {NPZ: NPZ, JSON: JSON, "application/*": JSON, "*/*": JSON}
 WEIGHT = re.compile(r";\s*q=(0(?:\.\d{0,3})?|1(?:\.0{0,3})?)\s*$")
 KEPT_BYTES = 64 * MEBIBYTE  # capacity of the cache; a policy's JSON is about 50 kB, with a million actions 3 MB

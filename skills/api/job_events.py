@@ -10,22 +10,20 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from time import monotonic
-from typing import Any
 
-import orjson
 from anyio import to_thread
 
+from skills.api.responses import json_of
 from skills.db.changes import Changes
 from skills.db.session import Database
 from skills.errors import SkillsError, TooMany
-from skills.library.operation.jobs import ACTIVE, find_job, find_jobs, job_json
-from skills.library.policies.releases import outcomes_of
+from skills.library.operation.jobs import ACTIVE, describe_job, describe_jobs, find_job, find_jobs
+from skills.schemas.operation import Job
 from skills.settings import Settings
 
 WATCH_S = 0.2
 ASKED_AGAIN_S = 1.0  # interval of the authorisation check: a stream ends within this and `authentication.REMEMBERED_S`
 AGAIN_S = 10.0
-State = dict[str, Any]
 
 
 class Watcher:
@@ -33,7 +31,7 @@ class Watcher:
 
     def __init__(self, job: str) -> None:
         self.job = job
-        self.now: State | None = None
+        self.now: Job | None = None
         self.changed = asyncio.Event()
 
 
@@ -66,15 +64,15 @@ class Watching:
         with self._place(job, key) as watcher:
             watcher.now = await to_thread.run_sync(_look, database, job)
             self._version = None  # a commit may have come in between: poll again
-            told, told_s = None, monotonic()
+            sent, sent_s = None, monotonic()
             while watcher.now is not None:
-                if watcher.now != told:
-                    told, told_s = watcher.now, monotonic()
-                    yield b"event: job\ndata: " + orjson.dumps(told) + b"\n\n"
-                    if told["state"] not in ACTIVE:
+                if watcher.now != sent:
+                    sent, sent_s = watcher.now, monotonic()
+                    yield b"event: job\ndata: " + json_of(sent) + b"\n\n"
+                    if sent.state not in ACTIVE:
                         return
-                elif monotonic() - told_s >= self._heartbeat_s:
-                    told_s = monotonic()
+                elif monotonic() - sent_s >= self._heartbeat_s:
+                    sent_s = monotonic()
                     yield b": the job goes on\n\n"
                 with suppress(TimeoutError):
                     await asyncio.wait_for(watcher.changed.wait(), min(ASKED_AGAIN_S, self._heartbeat_s))
@@ -124,14 +122,12 @@ class Watching:
                         watcher.changed.set()
 
 
-def _look(database: Database, job: str) -> State:
+def _look(database: Database, job: str) -> Job:
     with database.reading() as session:
         found = find_job(session, job)
-        return job_json(found, outcomes_of(session, [found])[found.row])
+        return describe_job(session, found)
 
 
-def _look_at_all(database: Database, jobs: set[str]) -> dict[str, State]:
+def _look_at_all(database: Database, jobs: set[str]) -> dict[str, Job]:
     with database.reading() as session:
-        found = find_jobs(session, jobs)
-        came_of = outcomes_of(session, found)
-        return {job.id: job_json(job, came_of[job.row]) for job in found}
+        return {job.id: job for job in describe_jobs(session, find_jobs(session, jobs))}

@@ -14,13 +14,12 @@ from fastapi import Depends, Header, Request, Response
 from pydantic import BaseModel
 from sqlalchemy.orm import Session
 
-from skills.api.encoded_policies import JSON
 from skills.db.service_tables import Job
 from skills.errors import PreconditionFailed
 from skills.formats import BYTES
-from skills.library.operation.jobs import job_json
-from skills.library.policies.releases import outcomes_of
+from skills.library.operation.jobs import describe_job
 
+JSON = "application/json"
 Condition = Annotated[str | None, Header(max_length=2000)]
 
 
@@ -169,7 +168,7 @@ def stored(said: Any, new: bool, location: str | None = None) -> Response:
 
 def accepted(session: Session, job: Job, did: str) -> Response:
     """Return the response to a request for a job: 200 once it succeeded, else 202; `did` is the request's effect."""
-    said = job_json(job, outcomes_of(session, [job])[job.row], did)
+    said = describe_job(session, job, did)
     return say(said, 200 if job.state == "succeeded" else 202, {"Location": f"/jobs/{job.id}"})
 
 

@@ -48,10 +48,7 @@ class Leaf(Base):
     __table_args__ = (
         Index("ix_history_key", "table_name", "key"),
         Index(
-            "ix_history_unsigned",
-            "row",
-            sqlite_where=text("number IS NULL"),
-            postgresql_where=text("number IS NULL"),
+            "ix_history_unsigned", "row", sqlite_where=text("number IS NULL"), postgresql_where=text("number IS NULL")
         ),
     )
 
@@ -151,12 +148,7 @@ class NewLeaf(NamedTuple):
 
 
 def new_leaf(
-    table: str,
-    change: str,
-    at: str | None,
-    key: str,
-    columns: Mapping[str, Any],
-    after: Latest | None = None,
+    table: str, change: str, at: str | None, key: str, columns: Mapping[str, Any], after: Latest | None = None
 ) -> NewLeaf:
     """Return a leaf for a row with these logged columns, which follows the row's leaf before."""
     salt = secrets.token_bytes(SALT_BYTES)

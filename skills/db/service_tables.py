@@ -26,6 +26,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 from skills.db import Base, Number, RowId, Sha256, now
 from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
+from skills.schemas.operation import JobState
 
 LONGEST_REASON = 2000  # characters
 
@@ -46,7 +47,7 @@ class Job(Base):
     id: Mapped[str] = mapped_column(String(32), unique=True)
     kind: Mapped[str] = mapped_column(String(20))
     identity: Mapped[str] = mapped_column(Sha256)
-    state: Mapped[str] = mapped_column(String(10), default="queued")
+    state: Mapped[JobState] = mapped_column(String(10), default="queued")
     progress: Mapped[float] = mapped_column(default=0.0)
     request: Mapped[dict[str, Any]]
     result: Mapped[dict[str, Any] | None]

@@ -177,10 +177,7 @@ class Database:
         """
         if self.engine.dialect.name != "sqlite":
             return  # PostgreSQL's vacuum does it
-        with (
-            self._errors(),
-            self.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection,
-        ):
+        with self._errors(), self.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def close(self) -> None:

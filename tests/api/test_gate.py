@@ -42,9 +42,7 @@ def remember_nothing(service: Service) -> None:
 # ---- keys
 
 
-def test_local_requests_need_a_key_once_the_first_key_was_made(
-    service: Service,
-):
+def test_local_requests_need_a_key_once_the_first_key_was_made(service: Service):
     assert service.http.put("/surgeons/kestrel", json={}).status_code == 201
     text = key(service, "anna", "reader")
     assert_problem(service.http.get("/surgeons"), 401, "not-signed-in")

@@ -4,8 +4,9 @@ from datetime import date, timedelta
 
 import pytest
 
-from skills.api.encoded_policies import JSON, NPZ
+from skills.api.encoded_policies import NPZ
 from skills.api.policy_cache import LONGEST, Known, _asked
+from skills.api.responses import JSON
 from skills.library.operation import integrity
 from skills.library.people import consent
 from skills.library.people.catalogue import find_surgeon, put_surgeon

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from sqlalchemy import text
 
-from skills.api.encoded_policies import JSON, NPZ, negotiate
-from skills.api.responses import Body
+from skills.api.encoded_policies import NPZ, negotiate
+from skills.api.responses import JSON, Body
 from skills.db.changes import APPLICATION, BOUND_S, WeightedCache
 from skills.db.session import Database
 from skills.errors import UnknownFormat

@@ -244,10 +244,7 @@ def test_who_may_not_open_one_is_refused_before_it_opens(posed: Service):
         ({"Authorization": f"Bearer {key}", "Origin": "http://elsewhere.org"}, 403),
         ({"Authorization": f"Bearer {key}", "Host": "elsewhere.org"}, 400),
     ):
-        with (
-            pytest.raises(WebSocketDenialResponse) as refused,
-            posed.http.websocket_connect(SESSION, headers=headers),
-        ):
+        with pytest.raises(WebSocketDenialResponse) as refused, posed.http.websocket_connect(SESSION, headers=headers):
             pass
         denied(refused.value, status)
     with opened(posed, key), opened(posed, key):

@@ -14,7 +14,8 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 from starlette.testclient import TestClient
 
-from skills.api.encoded_policies import JSON, NPZ, Encoded
+from skills.api.encoded_policies import NPZ, Encoded
+from skills.api.responses import JSON
 from skills.db.models import Demonstration
 from skills.db.service_tables import Job
 from skills.db.session import Database

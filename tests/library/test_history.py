@@ -26,7 +26,7 @@ from skills.errors import BadSettings, Corrupt, NotReady
 from skills.library.operation import locks, sweep
 from skills.library.operation.history import Verified, sign_history, verify_history
 from skills.library.operation.inspection import inspect_installation
-from skills.library.operation.proofs import first_head, served_json
+from skills.library.operation.proofs import first_head, served_at
 from skills.library.people import erasure
 from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.erasure import erase_surgeon
@@ -598,7 +598,7 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
     sign_history(database)
     asked = ("kestrel", cases.SUTURE, now())
     with database.reading() as session:
-        given = served_json(session, database.history, *asked)
+        given = served_at(session, database.history, *asked)
     for proof in given["proofs"]:
         check_disclosed(proof, given["checkpoint"]["note"], given["checkpoint"]["verifier"])
     for edit in (
@@ -609,7 +609,7 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
         with tampering(database) as connection, Session(connection) as session:
             connection.exec_driver_sql(edit.format(blob=BLOB[connection.dialect.name]))
             with pytest.raises(Corrupt, match="proves nothing"):
-                served_json(session, database.history, *asked)
+                served_at(session, database.history, *asked)
 
 
 def test_changes_of_a_row_follow_each_other_in_the_history(database: Database):

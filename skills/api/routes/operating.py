@@ -13,7 +13,8 @@ from skills.api.openapi import router_of, says
 from skills.api.pages import render
 from skills.api.responses import say
 from skills.jobs.readiness import refuse_unready
-from skills.library.operation.proofs import checkpoint_json, served_json
+from skills.library.operation.proofs import served_at as find_served
+from skills.library.operation.proofs import signed_checkpoint
 from skills.sandbox.containment import LAYERS
 from skills.sandbox.forked import layers_held
 from skills.schemas.given import Alive, Ready, ServedAt, SignedCheckpoint
@@ -49,14 +50,14 @@ def served_at(
 ) -> Response:
     """Return the version of a style that was served at a time, with proofs that need no trust in this service."""
     with db.reading() as session:
-        return say(served_json(session, db.history, surgeon, suture, at))
+        return say(find_served(session, db.history, surgeon, suture, at))
 
 
 @router.get("/history/checkpoint", dependencies=[needs("reader")], **says(SignedCheckpoint))
 def newest_head(db: Db) -> Response:
     """Return the newest signed checkpoint of the history, to be kept elsewhere."""
     with db.reading() as session:
-        return say(checkpoint_json(session.connection(), db.history))
+        return say(signed_checkpoint(session.connection(), db.history))
 
 
 @router.get("/metrics", dependencies=[needs("reader", whole=True)], response_class=PlainTextResponse)

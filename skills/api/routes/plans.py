@@ -17,10 +17,9 @@ from pydantic import Field
 
 from skills.api.authorisation import Asking, needs
 from skills.api.dependencies import Actor, Configured, Db, Digest, Jobs, Limit, Read, RowCursor, Tell, room_for_a_job
-from skills.api.encoded_policies import JSON
 from skills.api.openapi import gives, gives_file, gives_page, makes, router_of, says, starts_job
 from skills.api.pages import render
-from skills.api.responses import Giving, accepted, as_asked, say, stored
+from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
 from skills.api.routes.pages import PageRoute
 from skills.api.routes.policies import Accept
 from skills.api.routes.recordings import RAW_BODY

@@ -24,14 +24,7 @@ from skills.db import in_parts
 from skills.db.change_notes import REMOVE
 from skills.db.history import SCHEMA, History
 from skills.db.leaves import CHECKPOINTS, LEAVES, Latest, latest_leaves, newest_checkpoint
-from skills.db.logged_rows import (
-    CACHES,
-    ROWS_AT_ONCE,
-    Logged,
-    commitment_to,
-    logged,
-    schema_of,
-)
+from skills.db.logged_rows import CACHES, ROWS_AT_ONCE, Logged, commitment_to, logged, schema_of
 from skills.db.saved_heads import save_head
 from skills.db.session import Database
 from skills.db.tiles import TILES, fill_tiles, full_tiles, stored_tiles

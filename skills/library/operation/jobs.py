@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import now, rfc3339
+from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_event
@@ -27,9 +27,11 @@ from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
 from skills.library.operation import locks
 from skills.library.people.consent import require
-from skills.library.policies.releases import Outcome, is_served
+from skills.library.policies.releases import Outcome, is_served, outcomes_of
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
+from skills.schemas.operation import Job as JobAnswer
+from skills.schemas.operation import ServedNow
 
 BATCH, PART = "retraining", "retraining-part"
 EXPORT, PICTURES = "dataset", "pictures"
@@ -404,19 +406,29 @@ def cancel(session: Session, job_id: str, actor: str) -> Job:
     return job
 
 
-def job_json(row: Job, outcome: Outcome, did: str | None = None) -> dict[str, Any]:
-    """Return a job's JSON, with its outcome and the effect of the request that it answers."""
-    return {
-        "id": row.id,
-        "kind": row.kind,
-        "state": row.state,
-        "progress": row.progress,
-        "request": row.request,
-        "result": outcome.result,
-        "served": outcome.served,
-        "did": did,
-        "error": row.error,
-        "created_at": rfc3339(row.created_at),
-        "started_at": rfc3339(row.started_at),
-        "ended_at": rfc3339(row.ended_at),
-    }
+def describe_jobs(session: Session, jobs: Sequence[Job]) -> list[JobAnswer]:
+    """Return jobs with their outcomes, as the API answers."""
+    outcomes = outcomes_of(session, jobs)
+    return [_answer(job, outcomes[job.row], None) for job in jobs]
+
+
+def describe_job(session: Session, job: Job, did: str | None = None) -> JobAnswer:
+    """Return a job with its outcome and the effect of the request that it answers."""
+    return _answer(job, outcomes_of(session, [job])[job.row], did)
+
+
+def _answer(job: Job, outcome: Outcome, did: str | None) -> JobAnswer:
+    return JobAnswer(
+        id=job.id,
+        kind=job.kind,
+        state=job.state,
+        progress=job.progress,
+        request=job.request,
+        result=outcome.result,
+        served=None if outcome.served is None else ServedNow(**outcome.served),
+        did=did,
+        error=job.error,
+        created_at=job.created_at,
+        started_at=job.started_at,
+        ended_at=job.ended_at,
+    )

@@ -6,15 +6,7 @@ from dataclasses import dataclass
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from skills.db.models import (
-    Demonstration,
-    Plan,
-    StoredPictures,
-    StoredPlayback,
-    StoredRecording,
-    Surgeon,
-    SutureType,
-)
+from skills.db.models import Demonstration, Plan, StoredPictures, StoredPlayback, StoredRecording, Surgeon, SutureType
 from skills.db.service_tables import Job
 from skills.library.plans import playbacks
 

@@ -12,14 +12,7 @@ from typing import Any, Literal, NamedTuple
 from sqlalchemy import ColumnElement, Select, case, exists, func, select
 from sqlalchemy.orm import Session
 
-from skills.db.models import (
-    Demonstration,
-    PolicyDemonstration,
-    PolicyVersion,
-    Release,
-    Surgeon,
-    SutureType,
-)
+from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release, Surgeon, SutureType
 from skills.library.operation.overview import MOST, MOST_LISTED
 from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.policies.releases import is_served, served

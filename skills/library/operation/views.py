@@ -7,11 +7,7 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import (
-    Demonstration,
-    PolicyVersion,
-    StoredRewardMap,
-)
+from skills.db.models import Demonstration, PolicyVersion, StoredRewardMap
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import press_times, smoothed_speed
@@ -110,10 +106,7 @@ def _arm(recording: Recording, arm: str) -> dict[str, Any]:
     }
     if jaw is not None:
         every = max(1, len(jaw.values) // MOST_SAMPLES)
-        told["jaw"] = {
-            "t_s": _rounded(recording.seconds(jaw.stamps_ns[::every])),
-            "rad": _rounded(jaw.values[::every]),
-        }
+        told["jaw"] = {"t_s": _rounded(recording.seconds(jaw.stamps_ns[::every])), "rad": _rounded(jaw.values[::every])}
     return told
 
 
