@@ -43,7 +43,7 @@ def _fault(record: logging.LogRecord) -> bool:
     return not (type(error).__name__ == "DBOSAwaitedWorkflowCancelledError" or str(record.msg).endswith(ADOPTED))
 
 
-def told(logger: logging.Logger, message: str, level: int = logging.INFO, **fields: Any) -> None:
+def log_fields(logger: logging.Logger, message: str, level: int = logging.INFO, **fields: Any) -> None:
     """Log a record with fields."""
     logger.log(level, message, extra={"fields": fields})
 

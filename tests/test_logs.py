@@ -55,7 +55,7 @@ def lines(said: io.StringIO) -> list[dict[str, Any]]:
 
 def test_a_line_has_its_moment_its_ids_and_its_fields(said: io.StringIO):
     logs.request_id.set("deadbeef")
-    logs.told(logging.getLogger("skills.test"), "request", status=200, ms=1.5)
+    logs.log_fields(logging.getLogger("skills.test"), "request", status=200, ms=1.5)
     logs.request_id.set(None)
     (line,) = lines(said)
     assert line.pop("at").endswith("+00:00")

@@ -98,7 +98,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.watching = Watching(app.state.database, app.state.served.changes, settings)
     app.state.metrics = ServiceMetrics(app.state.database, settings.lease_s)
     app.state.sessions = Sessions(app.state.database, app.state.served.changes, settings)
-    app.state.metrics.sessions.set_function(lambda: app.state.sessions.count)
+    app.state.metrics.sessions.set_function(lambda: app.state.sessions.places.count)
     app.state.downloads = CapacityLimiter(DOWNLOADS_READ)
     app.state.access = Access(app.state.database, settings)
     # `include_router` would analyse every route again, at the first request of each application: 90 ms.

@@ -6,13 +6,13 @@ there are watchers.
 """
 
 import asyncio
-from collections import Counter
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from time import monotonic
 
 from anyio import to_thread
 
+from skills.api.places import Places
 from skills.api.responses import json_of
 from skills.db.changes import Changes
 from skills.db.session import Database
@@ -40,9 +40,10 @@ class Watching:
 
     def __init__(self, database: Database, changes: Changes, settings: Settings) -> None:
         self._database, self._changes = database, changes
-        self._heartbeat_s, self._most = settings.heartbeat_s, settings.key_watchers
+        self._heartbeat_s = settings.heartbeat_s
         self._watchers: set[Watcher] = set()
-        self._of_key: Counter[str] = Counter()
+        full = f"This key watches {settings.key_watchers} jobs already; close one of its streams, or poll the job."
+        self._places = Places(settings.key_watchers, TooMany(full, AGAIN_S))
         self._looking: asyncio.Task[None] | None = None
         self._version: int | None = None  # of the database at the last query
 
@@ -61,7 +62,7 @@ class Watching:
             TooMany: The key has as many streams open as it may.
             NotFound: There is no such job.
         """
-        with self._place(job, key) as watcher:
+        with self._places.place(key), self._watched(job) as watcher:
             watcher.now = await to_thread.run_sync(_look, database, job)
             self._version = None  # a commit may have come in between: poll again
             sent, sent_s = None, monotonic()
@@ -83,23 +84,15 @@ class Watching:
                     return
 
     @contextmanager
-    def _place(self, job: str, key: str | None) -> Iterator[Watcher]:
-        if key is not None and self._of_key[key] >= self._most:
-            raise TooMany(
-                f"This key watches {self._most} jobs already; close one of its streams, or poll the job.", AGAIN_S
-            )
+    def _watched(self, job: str) -> Iterator[Watcher]:
         watcher = Watcher(job)
         self._watchers.add(watcher)
-        self._of_key.update([] if key is None else [key])
         if self._looking is None:
             self._looking = asyncio.create_task(self._look_on())
         try:
             yield watcher
         finally:
             self._watchers.discard(watcher)
-            self._of_key.subtract([] if key is None else [key])
-            if key is not None and not self._of_key[key]:
-                del self._of_key[key]
             if not self._watchers and self._looking is not None:
                 self._looking.cancel()
                 self._looking = None

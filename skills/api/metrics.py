@@ -33,7 +33,7 @@ from skills.db.revisions import revisions
 from skills.db.session import Database
 from skills.errors import SkillsError
 from skills.library.operation.figures import Condition, condition_of, count_jobs
-from skills.logs import request_id, told
+from skills.logs import log_fields, request_id
 
 MANY_JOBS = 100_000  # ours: counting them takes 10 to 20 ms
 BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 120.0)
@@ -215,7 +215,9 @@ class Observed:
             self._metrics.seen(method, route, status, seconds)
             level = logging.DEBUG if route in PROBES else logging.INFO
             if log.isEnabledFor(level):
-                told(log, "request", level, method=method, route=route, status=status, ms=round(seconds * 1000, 2))
+                log_fields(
+                    log, "request", level, method=method, route=route, status=status, ms=round(seconds * 1000, 2)
+                )
             request_id.reset(token)
 
 

@@ -16,10 +16,10 @@ from functools import cached_property
 from typing import Any, NamedTuple, cast
 
 import orjson
-from sqlalchemy import JSON, BigInteger, Connection, Index, LargeBinary, String, Table, insert, select, text, update
+from sqlalchemy import JSON, BigInteger, Connection, Index, LargeBinary, String, Table, insert, select, update
 from sqlalchemy.orm import Mapped, mapped_column
 
-from skills.db import Base, RowId, now
+from skills.db import Base, RowId, now, partial_index
 from skills.db.change_notes import ADD, CHANGE, REMOVE, Effect
 from skills.db.logged_rows import ADDED, CACHES, ROWS_AT_ONCE, commitment_to, compact, digests_of, logged
 from skills.transparency.keys import Seal
@@ -47,9 +47,7 @@ class Leaf(Base):
 
     __table_args__ = (
         Index("ix_history_key", "table_name", "key"),
-        Index(
-            "ix_history_unsigned", "row", sqlite_where=text("number IS NULL"), postgresql_where=text("number IS NULL")
-        ),
+        partial_index("ix_history_unsigned", "row", where="number IS NULL"),
     )
 
 

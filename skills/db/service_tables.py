@@ -19,11 +19,10 @@ from sqlalchemy import (
     Table,
     UniqueConstraint,
     insert,
-    text,
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
-from skills.db import Base, Number, RowId, Sha256, now
+from skills.db import Base, Number, RowId, Sha256, now, partial_index
 from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
 from skills.schemas.operation import JobState
@@ -69,18 +68,11 @@ class Job(Base):
         Index("ix_jobs_kind_row", "kind", "row"),
         Index("ix_jobs_kind_state", "kind", "state", "row"),  # also for the counts at every metrics scrape
         Index("ix_jobs_plan", "plan", "kind", "row"),
-        Index(  # partial, for the retention: the others have not ended
-            "ix_jobs_ended",
-            "ended_at",
-            sqlite_where=text("ended_at IS NOT NULL"),
-            postgresql_where=text("ended_at IS NOT NULL"),
-        ),
-        Index(  # partial, so that failed and cancelled jobs can be requested again
-            "uq_jobs_identity_live",
-            "identity",
-            unique=True,
-            sqlite_where=text("state IN ('queued', 'running', 'succeeded')"),
-            postgresql_where=text("state IN ('queued', 'running', 'succeeded')"),
+        # for the retention: the others have not ended
+        partial_index("ix_jobs_ended", "ended_at", where="ended_at IS NOT NULL"),
+        # so that failed and cancelled jobs can be requested again
+        partial_index(
+            "uq_jobs_identity_live", "identity", where="state IN ('queued', 'running', 'succeeded')", unique=True
         ),
     )
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
 from math import inf
+from typing import Any
 
 from dbos import DBOSClient, WorkflowStatus
 from sqlalchemy import delete, func, select, update
@@ -93,21 +94,6 @@ ENDINGS = {
 ENGINE_FAILED = ("ERROR", "SUCCESS")
 
 
-@dataclass(frozen=True)
-class Live:
-    """A job that has not ended."""
-
-    row: int
-    attempt: int
-    submitted: bool
-    kind: str
-
-    @property
-    def workflow(self) -> str:
-        """The id of its workflow."""
-        return workflow_id(self.row, self.attempt)
-
-
 class Watch:
     """The periodic rounds of one worker."""
 
@@ -157,17 +143,18 @@ class Watch:
             return  # of another database than was signed last nothing is done
         self._take_over()
         live = self._live()
-        known = {w.workflow_id: w for w in self._workflows(live)}
-        for job in live:
-            workflow = known.get(job.workflow)
+        names = [workflow_id(job.row, job.attempt) for job in live]
+        known = {one.workflow_id: one for one in self._workflows(workflow_ids=names)} if names else {}
+        for job, name in zip(live, names, strict=True):
+            workflow = known.get(name)
             if workflow is None:
                 submit(self._client, job.row, job.attempt, job.kind)
             elif workflow.status in ENDINGS:
                 state, reason = ENDINGS[workflow.status]
                 fail(self._database, job.row, job.attempt, reason, state)
             elif workflow.status in ENGINE_FAILED:
-                self._begin_again(job)
-        self._note_submitted([job.row for job in live if not job.submitted])
+                self._begin_again(job.row, job.attempt)
+        self._note_submitted([job.row for job in live if job.submitted_at is None])
         if self._swept_s is None or time.monotonic() - self._swept_s > SWEEP_S:
             self._forget_ended()
             if self._sweep():
@@ -220,9 +207,7 @@ class Watch:
     def _forget_ended(self) -> None:
         """Delete some of the engine's rows of workflows that ended long ago; the outcomes are in our rows."""
         before = (now() - timedelta(days=ENGINE_DAYS)).isoformat()
-        ended = self._client.list_workflows(
-            status=["SUCCESS", *ENDINGS, "ERROR"], end_time=before, limit=AT_ONCE, load_input=False, load_output=False
-        )
+        ended = self._workflows(status=["SUCCESS", *ENDINGS, "ERROR"], end_time=before, limit=AT_ONCE)
         if ended:
             self._client.delete_workflows([one.workflow_id for one in ended])
 
@@ -243,13 +228,7 @@ class Watch:
         A workflow of another version of the steps, which only workers of that version could resume, is started again as
         a new attempt.
         """
-        left = self._client.list_workflows(  # without inputs and outputs, which are not needed here
-            status=["PENDING", "ENQUEUED"],
-            executor_id=dead,
-            queue_name=list(QUEUES),
-            load_input=False,
-            load_output=False,
-        )
+        left = self._workflows(status=["PENDING", "ENQUEUED"], executor_id=dead, queue_name=list(QUEUES))
         for workflow in left:
             if workflow.app_version != STEPS:
                 self._start_over(workflow.workflow_id)
@@ -262,27 +241,22 @@ class Watch:
         with self._database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == executor, Executor.beat_at == beat_at))
 
-    def _live(self) -> list[Live]:
+    def _live(self) -> Sequence[Any]:
         """Return jobs that have not ended: those never enqueued first, then the oldest.
 
         Batches themselves are left out, because the engine runs only their parts.
         """
-        query = select(Job.row, Job.attempt, Job.submitted_at.is_not(None), Job.kind).where(Job.state.in_(ACTIVE))
-        query = query.where(Job.kind != BATCH)
+        query = select(Job.row, Job.attempt, Job.submitted_at, Job.kind)
+        query = query.where(Job.state.in_(ACTIVE), Job.kind != BATCH)
         with self._database.reading() as session:
-            rows = session.execute(query.order_by(Job.submitted_at.is_not(None), Job.row).limit(AT_ONCE)).all()
-        return [Live(*row) for row in rows]
+            return session.execute(query.order_by(Job.submitted_at.is_not(None), Job.row).limit(AT_ONCE)).all()
 
-    def _workflows(self, live: Sequence[Live]) -> list[WorkflowStatus]:
-        if not live:
-            return []
-        names = [job.workflow for job in live]
-        return self._client.list_workflows(workflow_ids=names, load_input=False, load_output=False)
+    def _workflows(self, **chosen: Any) -> list[WorkflowStatus]:
+        """Return some workflows of the engine, without their inputs and outputs, which are not needed here."""
+        return self._client.list_workflows(**chosen, load_input=False, load_output=False)
 
     def _pending(self, executor: str | None = None, queues: Iterable[str] = QUEUES) -> list[WorkflowStatus]:
-        return self._client.list_workflows(
-            status="PENDING", queue_name=list(queues), executor_id=executor, load_input=False, load_output=False
-        )
+        return self._workflows(status="PENDING", queue_name=list(queues), executor_id=executor)
 
     def _start_over(self, workflow: str) -> None:
         """Start a new attempt at a job whose current attempt cannot be resumed.
@@ -297,16 +271,16 @@ class Watch:
             session.execute(update(Job).where(*mine).values(**again))
         cancel(self._client, row, attempt)
 
-    def _begin_again(self, job: Live) -> None:
+    def _begin_again(self, row: int, attempt: int) -> None:
         """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`."""
-        if job.attempt < ENGINE_ATTEMPTS:
-            log.warning("The job engine failed in job %d at attempt %d; it is started again.", job.row, job.attempt)
-            self._start_over(job.workflow)
+        if attempt < ENGINE_ATTEMPTS:
+            log.warning("The job engine failed in job %d at attempt %d; it is started again.", row, attempt)
+            self._start_over(workflow_id(row, attempt))
         else:
             reason = (
-                f"The job engine failed {job.attempt} times in this job; check the worker's log, then request it again."
+                f"The job engine failed {attempt} times in this job; check the worker's log, then request it again."
             )
-            fail(self._database, job.row, job.attempt, reason)
+            fail(self._database, row, attempt, reason)
 
     def _note_submitted(self, rows: Sequence[int]) -> None:
         if rows:

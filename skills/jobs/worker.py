@@ -32,7 +32,7 @@ from skills.jobs import BATCHES, JOBS, connect
 from skills.jobs.watch import Leases, Watch
 from skills.jobs.workflows import Perform, Work, engine_of, recover_workflows
 from skills.library.operation.sweep import SteadyClock, sweep
-from skills.logs import job_id, told
+from skills.logs import job_id, log_fields
 from skills.sandbox.forked import refuse_uncontained
 from skills.settings import Settings
 
@@ -71,7 +71,7 @@ def logged(perform: Perform) -> Perform:
             raise
         finally:
             seconds = round(time.monotonic() - began, 3)
-            told(log, "job", kind=kind, attempt=attempt, outcome=outcome, seconds=seconds)
+            log_fields(log, "job", kind=kind, attempt=attempt, outcome=outcome, seconds=seconds)
             job_id.reset(token)
 
     return run

@@ -56,7 +56,7 @@ def posed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service]:
     url = of_pose_style(request.param, tmp_path)
     with serving(url, key_sessions=2) as service:
         yield service
-        until(lambda: service.app.state.sessions.count == 0)
+        until(lambda: service.app.state.sessions.places.count == 0)
     backends.drop(url)
 
 
@@ -122,7 +122,7 @@ def test_a_session_has_the_other_arm_as_next_does(backend: str, tmp_path: Path):
                 hand, phase = {name: answer[name] for name in hand}, answer["phase"]
                 other = {"arm": "PSM1", **{name: there[name][phase] for name in (*hand, "jaw_rad")}}
                 assert answer["partner_pose"] == asked["partner_pose"] == other
-        until(lambda: service.app.state.sessions.count == 0)
+        until(lambda: service.app.state.sessions.places.count == 0)
     backends.drop(url)
 
 

@@ -49,7 +49,7 @@ def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
     found = {}
     with database.reading() as session:
         for table in dump.tables():
-            raw = dump.Dumped(table.name, [[c.name, dump.kind_of(c)] for c in table.columns], 0, "", None, 0).table
+            raw = dump.raw_table(table.name, [(c.name, dump.kind_of(c)) for c in table.columns])
             query = select(raw).order_by(*(raw.c[key.name] for key in table.primary_key))
             found[table.name] = [tuple(row) for row in session.execute(query)]
     found["events"] = [row for row in found["events"] if "restore" not in row]

@@ -24,7 +24,7 @@ from skills.library.operation.history import sign_history
 from skills.library.operation.jobs import ACTIVE, BATCH
 from skills.library.operation.sweep import sweep_erased
 
-Told = Callable[[str], None]  # progress callback; its argument is the name of the table or step
+Progress = Callable[[str], None]  # progress callback; its argument is the name of the table or step
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Restored:
     demos_marked: int = 0
 
 
-def back_up(database: Database, target: Path, told: Told = lambda _: None) -> Manifest:
+def back_up(database: Database, target: Path, progress: Progress = lambda _: None) -> Manifest:
     """Write a backup of the present state into a new file, without blocking other users.
 
     Raises:
@@ -51,7 +51,7 @@ def back_up(database: Database, target: Path, told: Told = lambda _: None) -> Ma
     if target.exists():
         raise Conflict(f"{target} exists; a backup never overwrites a file, so choose another name.")
     with appearing_file(target) as file, database.reading() as session:
-        return dump.write(file, session.connection(), __version__, told)
+        return dump.write(file, session.connection(), __version__, progress)
 
 
 def check_backup(source: Path) -> Manifest:
@@ -66,7 +66,9 @@ def check_backup(source: Path) -> Manifest:
         return dump.check(file)
 
 
-def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told: Told = lambda _: None) -> Restored:
+def restore(
+    database: Database, source: Path, erasures: Erasures = NOTHING, progress: Progress = lambda _: None
+) -> Restored:
     """Fill a database without tables from a backup and apply a list of erasures, in one transaction.
 
     Jobs that had not ended are submitted to the engine again by the first worker.
@@ -75,7 +77,7 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
         database: The target; it has no tables yet.
         source: The backup.
         erasures: The list to apply. Without it, everything that ended after the backup is in force again.
-        told: Progress callback, called with the name of the current table or step.
+        progress: Progress callback, called with the name of the current table or step.
 
     Raises:
         Conflict: The database is not empty, or the backup is newer than this version.
@@ -87,11 +89,11 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
         with database.writing() as session:
             if set(inspect(session.connection()).get_table_names()) & set(Base.metadata.tables):
                 raise Conflict("There is a database already; restore a backup only into an empty one.")
-            dump.load(file, manifest, session.connection(), told)
-            told("history")
+            dump.load(file, manifest, session.connection(), progress)
+            progress("history")
             database.history.go_on_after_restore(session.connection())
             fill_tiles(session.connection())
-            told("erasures")
+            progress("erasures")
             restored = Restored(manifest, **_end_again(session, erasures))
             session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(submitted_at=None))
             record_event(session, "local", "restore", "installation", manifest.created_at)

@@ -278,8 +278,8 @@ def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
     deleted = _here(later, "recordings", session, select(StoredRecording.sha256).where(uncut))
     for recording in deleted:
         delete_recording(session, recording, "restore", anybodys=True)
-    standing = select(Demonstration.sha256).where(Demonstration.withdrawn_at.is_(None))
-    withdrawn = _here(later, "withdrawn", session, standing)
+    active = select(Demonstration.sha256).where(Demonstration.withdrawn_at.is_(None))
+    withdrawn = _here(later, "withdrawn", session, active)
     for demo in withdrawn:
         withdraw_demo(session, demo, "restore")
     marked = _mark_again(session, later.outcomes)
@@ -321,8 +321,8 @@ def _here(later: Erasures, kind: str, session: Session, names: Select[str]) -> l
 
 def _served(session: Session) -> set[tuple[int, str]]:
     """Return the styles that have a released policy, as the surgeon's row and the suture type."""
-    standing = select(Release.surgeon_row, Release.suture).where(Release.withdrawn_at.is_(None)).distinct()
-    return {(surgeon, suture) for surgeon, suture in session.execute(standing)}
+    released = select(Release.surgeon_row, Release.suture).where(Release.withdrawn_at.is_(None)).distinct()
+    return {(surgeon, suture) for surgeon, suture in session.execute(released)}
 
 
 def _narrow(session: Session, consents: Mapping[str, tuple[datetime, Consent]]) -> int:

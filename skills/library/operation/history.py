@@ -107,7 +107,7 @@ def _sign_some(database: Database) -> str | None:
     with database.reading() as session:
         if not session.scalar(select(exists().where(LEAVES.c.number.is_(None)))):
             return None
-    with database.writing(()) as session:  # nobody waits for it: it changes no row but its own
+    with database.writing(()) as session:  # no other job depends on it
         connection = session.connection()
         if connection.dialect.name == "postgresql":
             mine = connection.scalar(text("SELECT pg_try_advisory_xact_lock(:lock)"), {"lock": SIGNING_LOCK})
