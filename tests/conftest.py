@@ -174,48 +174,6 @@ def shared_statements() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def shared_tables() -> Iterator[None]:
-    """Let restores into SQLite copy tables that were migrated once, instead of migrating from the first revision on.
-
-    That takes half of a restore; `tests/migrations` migrates.
-    """
-    from skills.db import dump
-    from skills.db.revisions import revision_of, revisions
-    from tests import backends
-
-    migrate = dump.upgrade
-
-    def upgrade(connection: Any, to: str = "head") -> None:
-        if connection.dialect.name == "sqlite" and to == revisions()[0] and revision_of(connection) is None:
-            for statement in backends.tables():
-                connection.exec_driver_sql(statement)
-        else:
-            migrate(connection, to)
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(dump, "upgrade", upgrade)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def shared_document() -> Iterator[None]:
-    """Let all applications of a process share its OpenAPI document, which takes most of a second to build."""
-    from skills.api.app import Service
-
-    build = Service.openapi
-    built: list[dict[str, Any]] = []
-
-    def openapi(application: Service) -> dict[str, Any]:
-        if not built:
-            built.append(build(application))
-        return built[0]
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Service, "openapi", openapi)
-        yield
-
-
 @pytest.fixture(scope="module", autouse=True)
 def forgotten() -> None:
     """Let no file of tests find in this process's caches the settings or the policies of another."""
