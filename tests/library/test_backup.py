@@ -272,7 +272,7 @@ def test_a_list_of_erasures_never_shrinks_and_is_refused_if_altered(database: Da
     kept = tmp_path / "erasures.json"
     at = datetime(2026, 1, 1, tzinfo=UTC)
     earlier = Erasures(frozenset({("00", "11" * 32, at)}), {"demonstrations": {"ab" * 32: at}})
-    assert keep_erasures(database, kept).surgeons == set()
+    assert keep_erasures(database, kept).surgeons == {}
     with database.writing() as session:
         erase_surgeon(session, "kestrel", "test")
     now_listed = keep_erasures(database, kept)

@@ -6,17 +6,16 @@ A backup cannot contain later changes. The list contains all of them, so that a 
 removes data and permissions, never adds them.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
+from pydantic import BaseModel, TypeAdapter
 from sqlalchemy import Select, exists, func, select, tuple_
 from sqlalchemy.orm import Session
 
-from skills.db import rfc3339
 from skills.db.models import SUCCESS, Demonstration, Erasure, LastUsed, PolicyVersion, Release, StoredRecording, Surgeon
 from skills.db.service_tables import Event, Key
 from skills.db.session import Database
@@ -30,7 +29,7 @@ from skills.library.recordings.demos import MARKS, mark_demo, withdraw_demo
 from skills.packing import canonical, sha256
 from skills.schemas import DemoOutcome
 
-ERASURES = "suture-skills erasures 1"
+ERASURES: Final = "suture-skills erasures 1"
 # Events that end something permanently, with the name of their list. Releases end by being superseded as well.
 ENDS = {
     ("erase", "demonstration"): "demonstrations",
@@ -65,20 +64,20 @@ class Erasures:
     surgeon with a consent is the random subject that events name as well.
 
     Attributes:
-        surgeons: Salt, salted digest and moment of each erased surgeon.
+        surgeons: The salt and the moment of each erased surgeon, by the salted digest.
         ended: Demonstrations that were erased or withdrawn, recordings that were deleted and policies that are no
             longer served, by their SHA-256, and revoked keys by their id; each with the moment at which it last ended.
         consents: The consent of each surgeon as last stated, by subject, and the moment of the statement.
         outcomes: The outcome of each marked demonstration, by its SHA-256, and the moment of the newest mark; not the
             reason, which may name a person.
-        numbers: The last version number of each style, by subject and suture type: it is never used again.
+        numbers: The last version number of each style, by "subject/suture type": it is never used again.
     """
 
-    surgeons: frozenset[tuple[str, str, datetime]] = frozenset()
+    surgeons: Mapping[str, tuple[str, datetime]] = field(default_factory=dict)
     ended: Ended = field(default_factory=dict)
     consents: Mapping[str, tuple[datetime, Consent]] = field(default_factory=dict)
     outcomes: Mapping[str, tuple[datetime, DemoOutcome]] = field(default_factory=dict)
-    numbers: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    numbers: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def demos(self) -> frozenset[str]:
@@ -89,7 +88,7 @@ class Erasures:
         """Return the union of two lists; for an entry in both the later moment counts."""
         kinds = [kind for kind in ENDS.values() if kind in self.ended or kind in other.ended]
         return Erasures(
-            self.surgeons | other.surgeons,
+            {**other.surgeons, **self.surgeons},
             {kind: _latest(self.ended.get(kind, {}), other.ended.get(kind, {})) for kind in kinds},
             {**other.consents, **_later(self.consents, other.consents)},
             {**other.outcomes, **_later(self.outcomes, other.outcomes)},
@@ -107,7 +106,8 @@ class Erasures:
         }
         consents, outcomes = _later(self.consents, known.consents), _later(self.outcomes, known.outcomes)
         numbers = {style: last for style, last in self.numbers.items() if not _knows(known.numbers, style, last)}
-        return Erasures(self.surgeons - known.surgeons, ended, consents, outcomes, numbers)
+        surgeons = {digest: erased for digest, erased in self.surgeons.items() if digest not in known.surgeons}
+        return Erasures(surgeons, ended, consents, outcomes, numbers)
 
 
 def _latest(one: Mapping[Any, M], other: Mapping[Any, M]) -> dict[Any, M]:
@@ -128,6 +128,18 @@ def _later(
 NOTHING = Erasures()
 
 
+class _File(BaseModel):
+    """The contents of a file with a list, and the SHA-256 of the list as canonical JSON."""
+
+    format: Literal["suture-skills erasures 1"]
+    erasures: Erasures
+    sha256: str
+
+
+def _digest(listed: Erasures) -> str:
+    return sha256(canonical(TypeAdapter(Erasures).dump_python(listed, mode="json")))
+
+
 def erasures_of(database: Database) -> Erasures:
     """Return the list of erasures of an installation."""
     with database.reading() as session:
@@ -139,16 +151,9 @@ def keep_erasures(database: Database, target: Path) -> Erasures:
     target.parent.mkdir(parents=True, exist_ok=True)
     with locked_folder(target.parent):
         listed = erasures_of(database) | (read_erasures(str(target)) if target.exists() else NOTHING)
-        content = {
-            "surgeons": sorted([salt, digest, rfc3339(at)] for salt, digest, at in listed.surgeons),
-            **{kind: _written(listed.ended.get(kind, {})) for kind in sorted(set(ENDS.values()))},
-            "consents": {who: [rfc3339(at), consent] for who, (at, consent) in sorted(listed.consents.items())},
-            "outcomes": {demo: [rfc3339(at), outcome] for demo, (at, outcome) in sorted(listed.outcomes.items())},
-            "numbers": [[*style, last] for style, last in sorted(listed.numbers.items())],
-        }
         with appearing_file(target) as file:
-            about = {"format": ERASURES, "erasures": content, "sha256": sha256(canonical(content))}
-            file.write(json.dumps(about, indent=1).encode() + b"\n")
+            written = _File(format=ERASURES, erasures=listed, sha256=_digest(listed))
+            file.write(written.model_dump_json(indent=1).encode() + b"\n")
     return listed
 
 
@@ -182,32 +187,17 @@ def read_erasures(source: str) -> Erasures:
         finally:
             database.close()
     try:
-        said = json.loads(Path(source).read_bytes())
-        content = said["erasures"]
-        if said["format"] != ERASURES or said["sha256"] != sha256(canonical(content)):
-            raise ValueError
-        return _read(content)
-    except (ValueError, KeyError, TypeError) as error:
+        said = _File.model_validate_json(Path(source).read_bytes())
+        if said.sha256 != _digest(said.erasures):
+            raise ValueError("changed")
+    except ValueError as error:
         raise Corrupt("This is not a list of erasures, or it was changed; use another copy of it.") from error
-
-
-def _read(content: dict[str, Any]) -> Erasures:
-    return Erasures(
-        frozenset((salt, digest, datetime.fromisoformat(at)) for salt, digest, at in content["surgeons"]),
-        {kind: {name: datetime.fromisoformat(at) for name, at in content[kind].items()} for kind in ENDS.values()},
-        {who: (datetime.fromisoformat(at), consent) for who, (at, consent) in content["consents"].items()},
-        {demo: (datetime.fromisoformat(at), outcome) for demo, (at, outcome) in content["outcomes"].items()},
-        {(subject, suture): last for subject, suture, last in content["numbers"]},
-    )
-
-
-def _written(ended: Mapping[str, datetime]) -> dict[str, str | None]:
-    return {name: rfc3339(at) for name, at in sorted(ended.items())}
+    return said.erasures
 
 
 def _listed(session: Session) -> Erasures:
     """Return the list of an installation, with moments in the order of its events (`_in_order`)."""
-    surgeons = {(one.salt, one.digest, one.erased_at) for one in session.scalars(select(Erasure))}
+    surgeons = {one.digest: (one.salt, one.erased_at) for one in session.scalars(select(Erasure))}
     ended: dict[str, dict[str, datetime]] = {kind: {} for kind in ENDS.values()}
     outcomes: dict[str, tuple[datetime, DemoOutcome]] = {}
     stated: dict[str | None, datetime] = {}
@@ -229,16 +219,17 @@ def _listed(session: Session) -> Erasures:
             stated[event.subject] = at
     described = session.execute(select(Surgeon.subject, Surgeon.created_at, Surgeon.consent))
     consents = {subject: (stated.get(subject, created_at), consent) for subject, created_at, consent in described}
-    return Erasures(frozenset(surgeons), ended, consents, outcomes, _numbers(session))
+    return Erasures(surgeons, ended, consents, outcomes, _numbers(session))
 
 
-def _numbers(session: Session) -> dict[tuple[str, str], int]:
+def _numbers(session: Session) -> dict[str, int]:
     """Return the last version number of each style, by subject and suture type, also of erased versions."""
-    found: dict[tuple[str, str], int] = {}
+    found: dict[str, int] = {}
     for of, number in ((PolicyVersion, PolicyVersion.version), (LastUsed, LastUsed.last)):
         query = select(Surgeon.subject, of.suture, func.max(number)).join(of, of.surgeon_row == Surgeon.row)
         for subject, suture, last in session.execute(query.group_by(Surgeon.subject, of.suture)):
-            found[subject, suture] = max(last, found.get((subject, suture), 0))
+            style = f"{subject}/{suture}"
+            found[style] = max(last, found.get(style, 0))
     return found
 
 
@@ -265,7 +256,7 @@ def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
     later, served = erasures.since(_listed(session)), _served(session)
     slugs = list(session.scalars(select(Surgeon.slug)))
     surgeons: set[str] = set()
-    for salt, digest, erased_at in sorted(later.surgeons):
+    for digest, (salt, erased_at) in sorted(later.surgeons.items()):
         surgeons.update(slug for slug in slugs if salted(salt, slug) == digest)
         session.add(Erasure(salt=salt, digest=digest, erased_at=erased_at))
     for slug in sorted(surgeons):
@@ -289,7 +280,8 @@ def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
         revoke_key(session, key, "restore")
     narrowed = _narrow(session, later.consents)
     rows = {one.subject: one.row for one in session.scalars(select(Surgeon))}
-    for (subject, suture), last in later.numbers.items():
+    for style, last in later.numbers.items():
+        subject, _, suture = style.partition("/")
         if subject in rows:
             session.add(LastUsed(surgeon_row=rows[subject], suture=suture, last=last))
     stopped = len(served - _served(session))
