@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from skills.errors import BadSignature, Corrupt
-from skills.transparency.keys import PublicKey, SigningKey
 from skills.transparency.merkle import Checkpoint, Tree
+from skills.transparency.signing_keys import PublicKey, SigningKey
 from skills.transparency.statements import LONGEST, Statement, attest, pae, read_envelope
 from tests.independent_history import check_envelope
 

@@ -32,7 +32,7 @@ from skills import __version__
 from skills.db.revisions import revisions
 from skills.db.session import Database
 from skills.errors import SkillsError
-from skills.library.operation.figures import Condition, condition_of, count_jobs
+from skills.library.operation.installation import Condition, condition_of, count_jobs
 from skills.logs import log_fields, request_id
 
 MANY_JOBS = 100_000  # ours: counting them takes 10 to 20 ms

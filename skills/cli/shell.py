@@ -108,7 +108,7 @@ if TYPE_CHECKING:
     from skills.client import Client, Progress
     from skills.schemas.operation import Job
     from skills.settings import Settings
-    from skills.transparency.keys import PublicKey
+    from skills.transparency.signing_keys import PublicKey
 
 out = Console(highlight=False, width=None if sys.stdout.isatty() else 160)  # in a pipe, wide enough not to wrap digests
 err = Console(stderr=True, highlight=False)
@@ -254,7 +254,7 @@ KEY = "The public key of the service that signed it, or a file with the key, as 
 
 def read_key(key: str) -> "PublicKey":
     """Read a public key from the text of an option, or from the file that it names."""
-    from skills.transparency.keys import PublicKey
+    from skills.transparency.signing_keys import PublicKey
 
     with files():
         return PublicKey.read(key if key.count("+") >= 2 and not Path(key).exists() else Path(key).read_text())

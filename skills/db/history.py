@@ -32,9 +32,9 @@ from skills.db.logged_rows import logged, schema_of
 from skills.db.saved_heads import archive_heads, heads_file_for, last_head
 from skills.errors import BadSettings, Corrupt, NotReady
 from skills.remedies import Action, Remedy
-from skills.transparency.keys import Seal, SigningKey
 from skills.transparency.merkle import HASH_BYTES, Checkpoint, Tree, leaf_hash
 from skills.transparency.notes import Note, read_notes
+from skills.transparency.signing_keys import Seal, SigningKey
 
 SCHEMA = "schema"  # the name under which triggers, indexes and constraints are logged as if they were rows
 SIGNED_AT_ONCE = 1000  # leaves in one transaction, some 50 ms

@@ -22,8 +22,8 @@ from sqlalchemy.orm import Mapped, mapped_column
 from skills.db import Base, RowId, now, partial_index
 from skills.db.change_notes import ADD, CHANGE, REMOVE, Effect
 from skills.db.logged_rows import ADDED, CACHES, ROWS_AT_ONCE, commitment_to, compact, digests_of, logged
-from skills.transparency.keys import Seal
 from skills.transparency.merkle import leaf_hash
+from skills.transparency.signing_keys import Seal
 
 SALT_BYTES = 32
 

@@ -9,8 +9,8 @@ import re
 from dataclasses import dataclass
 
 from skills.errors import Corrupt
-from skills.transparency.keys import KEY_ID_BYTES, PublicKey, key_id
 from skills.transparency.merkle import Checkpoint
+from skills.transparency.signing_keys import KEY_ID_BYTES, PublicKey, key_id
 
 _NOTE = re.compile(
     r"^(?P<origin>[^\s+]+)\n(?P<size>0|[1-9]\d{0,18})\n(?P<root>[A-Za-z0-9+/]{43}=)\n\n"

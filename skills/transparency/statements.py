@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, Field
 from skills.errors import BadSignature, Corrupt
 from skills.fields import Sha256
 from skills.packing import canonical
-from skills.transparency.keys import PublicKey, SigningKey
+from skills.transparency.signing_keys import PublicKey, SigningKey
 
 STATEMENT = "https://in-toto.io/Statement/v1"
 PREDICATE = "urn:suture-skills:signed:1"

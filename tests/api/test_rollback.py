@@ -18,8 +18,8 @@ from skills.library.operation.history import Verified, sign_history, sign_some_h
 from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw
 from skills.settings import Settings
-from skills.transparency.keys import SigningKey
 from skills.transparency.notes import read_notes
+from skills.transparency.signing_keys import SigningKey
 from tests import backends
 from tests.api.service import POLICY, Service, assert_problem, serving
 from tests.library import cases

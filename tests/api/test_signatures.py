@@ -8,7 +8,7 @@ import pytest
 from skills.errors import Busy
 from skills.library.operation import proofs
 from skills.library.people.catalogue import find_surgeon, put_surgeon
-from skills.transparency.keys import SigningKey
+from skills.transparency.signing_keys import SigningKey
 from tests.api.service import KESTREL, POLICY, Service, assert_problem
 from tests.independent_history import check_envelope, root_in
 

@@ -21,7 +21,7 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.jobs.watch import Leases, Watch
 from skills.library.operation import jobs
-from skills.library.operation.figures import condition_of, count_jobs
+from skills.library.operation.installation import condition_of, count_jobs
 from skills.library.operation.jobs import BATCH
 from skills.library.people import catalogue
 from skills.library.policies import versions

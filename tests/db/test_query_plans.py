@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from skills.db.session import Database
 from skills.jobs.watch import Leases, Watch
 from skills.library.operation import jobs
-from skills.library.operation.figures import count_jobs
+from skills.library.operation.installation import count_jobs
 from skills.library.operation.overview import newest_job
 from skills.library.operation.styles import matrix, released_styles
 from skills.library.people import catalogue

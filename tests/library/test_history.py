@@ -34,9 +34,9 @@ from skills.library.policies.releases import withdraw
 from skills.library.recordings import recordings
 from skills.library.recordings.recordings import stored_recording
 from skills.settings import Settings
-from skills.transparency.keys import SigningKey
 from skills.transparency.merkle import Checkpoint, Tree, inclusion_proof, leaf_hash, node_from
 from skills.transparency.notes import read_notes
+from skills.transparency.signing_keys import SigningKey
 from tests import backends
 from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed, check_inclusion

@@ -38,7 +38,7 @@ from skills.library.operation.jobs import BATCH, PART
 from skills.library.perform import perform_job
 from skills.packing import sha256
 from skills.settings import Settings
-from skills.transparency.keys import SigningKey
+from skills.transparency.signing_keys import SigningKey
 from tests import backends
 from tests.api.service import CSV, Service
 from tests.library import cases
