@@ -110,7 +110,7 @@ def test_the_table_of_rooms_names_each_after_those_that_it_imports():
         ("fastapi", "api/"),
         ("prometheus_client", "api/metrics.py"),
         ("typer", "cli/"),
-        ("cachetools", "db/changes.py"),
+        ("cachetools", "db/weighted_cache.py"),
         ("cryptography", "transparency/signing_keys.py"),
     ],
 )

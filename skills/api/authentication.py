@@ -18,8 +18,8 @@ from sqlalchemy.orm import Session
 from skills.api.authorisation import LOCAL, Caller
 from skills.api.rate_limits import RateLimits
 from skills.db import now
-from skills.db.changes import WeightedCache
 from skills.db.session import Database
+from skills.db.weighted_cache import WeightedCache
 from skills.errors import Busy, NotSignedIn, TooMany
 from skills.library.operation.locks import SIGN_INS
 from skills.library.people.keys import (

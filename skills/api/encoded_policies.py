@@ -7,9 +7,9 @@ from functools import lru_cache
 import orjson
 
 from skills.api.responses import JSON, Body, tag_of
-from skills.db.changes import WeightedCache
 from skills.db.history import History
 from skills.db.models import PolicyVersion, Release
+from skills.db.weighted_cache import WeightedCache
 from skills.errors import UnknownFormat
 from skills.library.operation.proofs import sign_files
 from skills.library.policies import versions

@@ -20,8 +20,9 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from skills.api.authorisation import Needs
 from skills.api.encoded_policies import KEPT_BYTES, Encoded, negotiate
 from skills.api.responses import Body, answer
-from skills.db.changes import Unasked, WeightedCache, changes_of
+from skills.db.changes import Unasked, changes_of
 from skills.db.session import Database
+from skills.db.weighted_cache import WeightedCache
 from skills.errors import Busy, SkillsError, UnknownFormat
 from skills.library.comparison import neighbours
 from skills.library.operation import integrity

@@ -9,7 +9,7 @@ the full rate; `skills serve` is one process. Jobs are counted in the database, 
 import time
 from collections.abc import Callable
 
-from skills.db.changes import WeightedCache
+from skills.db.weighted_cache import WeightedCache
 from skills.errors import TooMany
 from skills.settings import Settings
 

@@ -11,7 +11,8 @@ import pytest
 from sqlalchemy import select
 from starlette.testclient import TestClient
 
-from skills.api.pages import BORROWED, assets, build, number, share, size
+from skills.api.pages.assets import BORROWED, assets, build
+from skills.api.pages.filters import number, share, size
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
 from skills.db.service_tables import Job
 from skills.learning.policy import rollout_from

@@ -16,8 +16,9 @@ from sqlalchemy import text
 
 from skills.api.encoded_policies import NPZ, negotiate
 from skills.api.responses import JSON, Body
-from skills.db.changes import APPLICATION, BOUND_S, WeightedCache
+from skills.db.changes import APPLICATION, BOUND_S
 from skills.db.session import Database
+from skills.db.weighted_cache import WeightedCache
 from skills.errors import UnknownFormat
 from skills.library.operation import integrity
 from skills.library.people.catalogue import put_surgeon

@@ -13,7 +13,8 @@ from sqlalchemy.orm import Session
 from skills import errors
 from skills.api.authorisation import Asking, Caller, needs, open_to_all
 from skills.api.dependencies import Configured, Db, Digest, Limit, RowCursor, Slug, SlugCursor, Tell
-from skills.api.pages import assets, build, drawings, render
+from skills.api.pages import drawings, render
+from skills.api.pages.assets import assets, build
 from skills.api.responses import JSON
 from skills.api.routes.policies import JobId, Version
 from skills.db.session import Database
