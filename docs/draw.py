@@ -21,8 +21,8 @@ from skills.planning.handoff import PsmM
 from skills.report.figures import CELLS, GOAL, RECORDED, ROLLOUT
 from skills.seeds.recordings import sample_recordings
 from skills.verification.arm_errors import CALIBRATED, CALLED
-from skills.verification.monte_carlo import doubt
-from skills.verification.probabilities import DoubtSettings
+from skills.verification.monte_carlo import estimate_success
+from skills.verification.probabilities import EstimateSettings
 
 SEED = 0
 RUNS = 200
@@ -167,13 +167,13 @@ def draw_probability() -> Figure:
     def judged(scale: float) -> Any:
         sizes = {size: scale * getattr(CALIBRATED, size) for size in CALLED}
         errors = replace(CALIBRATED, **sizes) if scale != 1.0 else CALIBRATED
-        return doubt(
+        return estimate_success(
             trajectory,
             approach_m=APPROACH,
             pad_top_mm=TISSUE_MM,
             errors=errors,
             seed=SEED,
-            settings=DoubtSettings(),
+            settings=EstimateSettings(),
         )
 
     found = [judged(scale) for scale in SCALES]

@@ -1,7 +1,7 @@
 """Compilation of loops with numba: ordinary Python loops as machine code, loaded only from folders that are safe.
 
     @compiled
-    def loop(...)   called as machine code; `loop.plain` is the Python function
+    def loop(...)   called as machine code; its attribute `plain` is the Python function
 
 A loop stands beside its caller. It takes arrays and numbers, allocates nothing and raises nothing; the plain function
 and the compiled one agree to the last bit, and a test checks it.

@@ -88,7 +88,7 @@ def distinct_numbers(bits: Any, found: Any, places: Any, slots: Any, shift: Any)
     return count
 
 
-def painted(palette: Palette) -> Floats:
+def unpack_palette(palette: Palette) -> Floats:
     """Return the array of a palette.
 
     Raises:
@@ -123,7 +123,7 @@ def added_later(value: type, field: str) -> None:
     _ADDED.add((value, field))
 
 
-def few_numbers(value: type, field: str) -> None:
+def store_as_palette(value: type, field: str) -> None:
     """Register a field whose array has few distinct numbers: it is stored as a palette, if that has room for them."""
     _FEW.add((value, field))
 
@@ -229,7 +229,7 @@ def build(tree: Any, arrays: Arrays, classes: Known) -> Any:
     if "array" in tree:
         return arrays[tree["array"]]
     if "palette" in tree:
-        return painted(Palette(arrays[tree["palette"]], arrays[tree["palette"] + 1]))
+        return unpack_palette(Palette(arrays[tree["palette"]], arrays[tree["palette"] + 1]))
     if "bytes" in tree:
         return arrays[tree["bytes"]].tobytes()
     if "dict" in tree:

@@ -89,3 +89,18 @@ def best_turn(covariance: Floats) -> Floats:
     matrix[:3, 3] = matrix[3, :3] = across
     matrix[3, 3] = size + np.finfo(float).tiny  # of points that all are in one place, no turn
     return dominant(matrix + least * np.eye(4))
+
+
+def mean_rotation(rotation_xyzw: Floats, weights: Floats) -> Floats:
+    """Return the weighted mean orientation at each phase.
+
+    It is the eigenvector of the largest eigenvalue of the weighted sum of outer products, so q and -q are the same.
+
+    Args:
+        rotation_xyzw: Orientations of K demonstrations, unit quaternions, shape (K, P, 4).
+        weights: The weight of each demonstration, shape (K,).
+
+    Returns:
+        Unit quaternions of either sign, shape (P, 4).
+    """
+    return dominant(np.einsum("k,kpi,kpj->pij", weights, rotation_xyzw, rotation_xyzw))

@@ -363,7 +363,7 @@ GUARDS = (
     ),
     Guard(
         "skills/verification/gates.py", 36,
-        ("tests/verification/test_limits.py", "tests/verification/test_playback.py",
+        ("tests/verification/test_verdict.py",
          "tests/verification/test_scene_clearance.py", "tests/verification/test_bodies.py",
          "tests/verification/test_intent.py::test_the_verdict_names_it_though_the_arms_did_as_the_trajectory_says"),
         ("figures_of", "_arm", "_rotation_error_deg", "Limits", "_Gate", "first_failure", "_gates", "_joint_gates",
@@ -422,8 +422,8 @@ GUARDS = (
         ("counted", "_pass", "share"),
     ),
     Guard(
-        "skills/verification/intent.py", 24,
-        tuple(f"tests/verification/test_intent{part}.py" for part in ("", "_passes", "_jaws", "_transfers")),
+        "skills/verification/pass_comparison.py", 24,
+        ("tests/verification/test_intent.py", "tests/verification/test_pass_comparison.py"),
     ),
 )  # fmt: skip
 
@@ -451,17 +451,17 @@ EQUIVALENT: dict[tuple[str, str], str] = {
         "figures_of: if m is not None or playback.psm_m_tip_mm is not None:",
     ): "a verdict refuses a playback with PSM_M of a trajectory without, and the reverse, before there are figures",
     (
-        "skills/verification/intent.py",
-        "_Pass._recording: at, firm = hand.index(clock_s), ~(clock_s <= firm_s)",
+        "skills/verification/pass_comparison.py",
+        "PassComparison._recording: at, firm = hand.index(clock_s), ~(clock_s <= firm_s)",
     ): "differs for a sample exactly at that moment alone, which is also one of those that it is then compared with",
     (
-        "skills/verification/intent.py",
-        "_Pass._recording: rests_s = np.where(np.minimum(passed_s, passed_s[-1] - passed_s) < REST_S / self.tempo, "
-        "3 * REST_S, 0.0)",
+        "skills/verification/pass_comparison.py",
+        "PassComparison._recording: "
+        "rests_s = np.where(np.minimum(passed_s, passed_s[-1] - passed_s) < REST_S / self.tempo, 3 * REST_S, 0.0)",
     ): "within `REST_S` of an end a stand grows by no more than that: a longer one was too long before",
     (
-        "skills/verification/intent.py",
-        "_Pass._stands: if speed.max(initial=0.0) <= _LEAST_MM:",
+        "skills/verification/pass_comparison.py",
+        "PassComparison._stands: if speed.max(initial=0.0) <= _LEAST_MM:",
     ): "differs for a greatest step of exactly 0.0001 mm alone, which no joints of a motion give",
 }
 

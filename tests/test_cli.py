@@ -21,7 +21,6 @@ from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import find_dataset
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.gridworld.scene import Scene
-from skills.library.people.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
 from skills.simulation import film
@@ -310,7 +309,7 @@ def test_a_batch_trains_styles_names_failures_and_sets_the_exit_code(skills) -> 
     assert all(style["comparison"]["now_released"] for style in batch["items"])
     database = Database(settings().database_url)
     with database.writing() as session:
-        put_surgeon(session, "wren", {"consent": {"uses": [], "until": None}}, "test")
+        cases.agree(session, {"uses": [], "until": None}, "wren")
     database.close()
     code, said = skills("retrain", "--surgeon", "wren", "--release")
     assert (code, "does not cover training" in said, "failed" in said) == (1, True, False), said

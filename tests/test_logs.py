@@ -149,7 +149,7 @@ def test_nobody_is_in_the_log_whatever_is_asked_and_however_it_fails(
     def fail(*_: object) -> None:
         raise RuntimeError(f"no such surgeon: {CANARY}")
 
-    monkeypatch.setattr("skills.library.people.catalogue.find_surgeon", fail)
+    monkeypatch.setattr("skills.library.people.surgeons.find_surgeon", fail)
     assert http.get(f"/surgeons/{CANARY}").status_code == 500
     assert [line["error"] for line in lines(said) if "error" in line] == ["RuntimeError"]
     assert CANARY not in said.getvalue()

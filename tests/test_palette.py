@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
 
-from skills.packing import MOST_COLOURS, Palette, painted, palette_of
+from skills.packing import MOST_COLOURS, Palette, distinct_numbers, palette_of, unpack_palette
 
 SHAPES = some.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=9)
 ANY_BITS = some.arrays(np.uint64, SHAPES, elements=st.integers(0, 2**64 - 1)).map(lambda bits: bits.view(np.float64))
@@ -27,7 +27,7 @@ def test_every_bit_comes_back(values):
     if palette is None:
         assert len(set(values.view(np.uint64).ravel().tolist())) > MOST_COLOURS
         return
-    back = painted(palette)
+    back = unpack_palette(palette)
     assert (back.dtype, back.shape, back.tobytes()) == (values.dtype, values.shape, values.tobytes())
 
 
@@ -50,7 +50,7 @@ def test_as_many_as_a_byte_can_name_have_a_palette_and_one_more_has_none(seed):
     values = rng.permutation(np.concatenate([most, rng.choice(most, 1000)]))
     palette = palette_of(values)
     assert sorted(palette.colours) == sorted(most)
-    assert np.array_equal(painted(palette), values)
+    assert np.array_equal(unpack_palette(palette), values)
     assert palette_of(np.append(values, 2.0)) is None
 
 
@@ -68,4 +68,18 @@ def test_as_many_as_a_byte_can_name_have_a_palette_and_one_more_has_none(seed):
 )
 def test_what_is_no_palette_is_refused(palette):
     with pytest.raises((ValueError, IndexError)):
-        painted(palette)
+        unpack_palette(palette)
+
+
+@settings(deadline=None)
+@given(some.arrays(float, st.integers(0, 300), elements=st.sampled_from([0.0, -0.0, 1.0, 0.1, np.nan, np.inf, 5e-324])))
+def test_the_compiled_palette_and_the_plain_one_agree(values):
+    bits, found = values.view(np.uint64), []
+    for tell_apart in (distinct_numbers.plain, distinct_numbers):
+        read_only = bits.copy()
+        read_only.flags.writeable = False
+        colours, places, slots = np.zeros(4, np.uint64), np.zeros(len(bits), np.uint8), np.full(8, -1, np.int16)
+        with np.errstate(over="ignore"):  # the product's upper bits are meant to be lost
+            count = tell_apart(read_only, colours, places, slots, np.uint64(61))
+        found.append((count, colours.tobytes(), places.tobytes(), slots.tobytes()))
+    assert found[0] == found[1]

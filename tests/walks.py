@@ -22,6 +22,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import skills
+from skills.compiled import LOOPS
 from skills.formats.parsed import parse_recording
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, MCAP, POLICY, serving
@@ -34,13 +35,14 @@ COMMON += (
     "client/",
     "api/app",
     "jobs/__init__",
-    "library/people/catalogue.py",
+    "library/people/surgeons.py",
+    "library/people/suture_types.py",
     "library/people/keys.py",
     "library/operation/locks.py",
 )
 COMMON += ("library/operation/history.py", "transparency/")  # what is written is logged, whoever writes it
 ONCE = ("find_plan", "time_parametrise", "stack", "plan_identity")
-PERIODIC = ("forget_erased", "forget_gone", "_sweep", "is_right")  # part of no request, and a slow walk has them
+PERIODIC = ("forget_erased", "forget_gone", "_sweep", "is_last_signed")  # part of no request, and a slow walk has them
 STARTING = ("confined_reader", "stated_errors", "migrate", "seed_catalogue", "create_app")  # called once by the service
 # Numbers, bytes and words: a reader knows them after the first page, and stays in the room that calls them.
 TOOLS = ("arrays.py", "arithmetic.py", "quaternions.py", "kinematics.py", "compiled.py", "packing.py", "fields.py")
@@ -88,6 +90,7 @@ class Trace:
             or code.co_name.startswith(("_", "<", *PERIODIC, *STARTING))
             or file.startswith(COMMON)
             or re.search(r"/_[a-z]", file)
+            or any(loop.plain.__code__ is code for loop in LOOPS)
         ):
             return
         caller = frame.f_back

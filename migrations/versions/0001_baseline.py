@@ -254,6 +254,7 @@ def upgrade() -> None:
         sa.Column("demo", sa.LargeBinary(), nullable=False),
         sa.Column("path", sa.LargeBinary(), nullable=False),
         sa.Column("report", sa.JSON(), nullable=False),
+        sa.Column("segment", sa.JSON(), nullable=False),
         sa.Column("created_at", MOMENT, nullable=False),
         sa.Column("withdrawn_at", MOMENT, nullable=True),
         sa.ForeignKeyConstraint(["recording_row"], ["recordings.row"], name="fk_demonstrations_recording_row"),

@@ -40,7 +40,7 @@ from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
 from skills.jobs import Engine
 from skills.library.operation.history import sign_some_history
-from skills.library.people.catalogue import seed_catalogue
+from skills.library.people.suture_types import seed_suture_types
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.recordings.recordings import confined_reader
 from skills.logs import request_id
@@ -143,7 +143,7 @@ def prepare_database(database: Database, settings: Settings) -> None:
     database.migrate()
     database.compare_history()
     with database.writing() as session:
-        seed_catalogue(session)
+        seed_suture_types(session)
     sign_some_history(database)
 
 

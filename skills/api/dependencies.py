@@ -9,7 +9,7 @@ from skills.api.authorisation import Asking
 from skills.db.session import Database
 from skills.jobs import Engine
 from skills.library.operation.jobs import refuse_too_many
-from skills.library.recordings.recordings import Reader, Teller
+from skills.library.recordings.recordings import Parser, Reader
 from skills.schemas.requests import DIGEST, SLUG
 from skills.settings import Settings
 
@@ -31,7 +31,7 @@ async def _reader(request: Request, caller: Asking) -> Reader:
     return partial(request.app.state.reader, key=caller.name)
 
 
-async def _teller(request: Request, caller: Asking) -> Teller:
+async def _parser(request: Request, caller: Asking) -> Parser:
     """Return the reader that also describes a recording, with the caller's name as the key of its queue."""
     return partial(request.app.state.reader.parse, key=caller.name)
 
@@ -49,7 +49,7 @@ async def _actor(caller: Asking) -> str:
 Db = Annotated[Database, Depends(_database)]
 Jobs = Annotated[Engine, Depends(_engine)]
 Read = Annotated[Reader, Depends(_reader)]
-Tell = Annotated[Teller, Depends(_teller)]
+Parse = Annotated[Parser, Depends(_parser)]
 Configured = Annotated[Settings, Depends(_settings)]
 Actor = Annotated[str, Depends(_actor)]
 Slug = Annotated[str, Path(pattern=SLUG)]

@@ -58,7 +58,7 @@ def atlas(
         out.print(sentence, markup=False, soft_wrap=True)
     _tables(found)
     for pair in found.differences:
-        out.print(f"- {pair.said}", markup=False, soft_wrap=True)
+        out.print(f"- {pair.sentence}", markup=False, soft_wrap=True)
     _recognition(found)
 
 
@@ -103,8 +103,8 @@ def _recognition(found: "Atlas") -> None:
             f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%}",
             soft_wrap=True,
         )
-    if found.whose is not None:
-        whose = found.whose
+    if found.recognised is not None:
+        whose = found.recognised
         likely = ", ".join(f"{one.surgeon} {one.probability:.0%}" for one in whose.likely[:3])
         voted = f"; its recording votes for {whose.voted} ({whose.voters})" if whose.voted else ""
         out.print(
@@ -330,7 +330,7 @@ def _tell_left_out(left_out: dict[str, list[str]]) -> None:
 
 def _tell_judged(about: dict[str, Any]) -> None:
     """Print the quality of the model and of its rivals, for each task."""
-    from skills.demonstration.quality import times_in_words
+    from skills.demonstration.quality import describe_count
 
     tasks, validated = about["data"]["tasks"], about["validated"]
     for name, judged in validated["tasks"].items():
@@ -340,7 +340,7 @@ def _tell_judged(about: dict[str, Any]) -> None:
     if len(tasks) > 1:
         out.print("The mean of the tasks")
         _tell_task(validated["mean"])
-    chosen = "; ".join(f"{design} ({times_in_words(count)})" for design, count in validated["chosen"].items())
+    chosen = "; ".join(f"{design} ({describe_count(count)})" for design, count in validated["chosen"].items())
     out.print(f"Chosen with a surgeon left out: {chosen}", markup=False, soft_wrap=True)
 
 

@@ -446,7 +446,7 @@ def create(
     with _database() as database, database.writing() as session:
         expires_at = None if days is None else now() + timedelta(days=days)
         key, text = create_key(session, owner, role, "local", expires_at=expires_at, surgeons=surgeon)
-        about = about_key(key)
+        about = about_key(key).model_dump(mode="json")
     if as_json:
         out.print_json(json.dumps(about | {"secret": text}))
         return
@@ -461,7 +461,7 @@ def list_all(as_json: AsJson = False) -> None:
     from skills.library.people.keys import about_key, list_keys
 
     with _database() as database, database.reading() as session:
-        found = [about_key(key) for key in list_keys(session)]
+        found = [about_key(key).model_dump(mode="json") for key in list_keys(session)]
     show(found if as_json else [_in_words(one) for one in found], as_json, COLUMNS)
 
 
@@ -474,7 +474,7 @@ def revoke(
     from skills.library.people.keys import about_key, revoke_key
 
     with _database() as database, database.writing() as session:
-        about = about_key(revoke_key(session, key, "local"))
+        about = about_key(revoke_key(session, key, "local")).model_dump(mode="json")
     show(about if as_json else _in_words(about), as_json, COLUMNS)
 
 

@@ -255,7 +255,7 @@ def play(
         for under in playback.report.doubt.under:
             least = min(one.succeeds.lower for one in under.passes)
             out.print(
-                f"{under.errors.name}: {under.errors.in_words}; every pass succeeds with a probability of at least "
+                f"{under.errors.name}: {under.errors.describe()}; every pass succeeds with a probability of at least "
                 f"{least:.3f} (95 %)",
                 markup=False,
                 soft_wrap=True,
@@ -366,7 +366,7 @@ def calibrate(
                 cell(round(one.assumed_width, 3)),
             )
     out.print(table)
-    out.print(found.in_words, markup=False, soft_wrap=True)
-    out.print(f"{found.errors.name}: {found.errors.in_words}", markup=False, soft_wrap=True)
+    out.print(found.describe(), markup=False, soft_wrap=True)
+    out.print(f"{found.errors.name}: {found.errors.describe()}", markup=False, soft_wrap=True)
     if slip is not None:
-        out.print(slip.in_words, markup=False, soft_wrap=True)
+        out.print(slip.describe(), markup=False, soft_wrap=True)

@@ -181,7 +181,7 @@ Row = dict[str, str]
 @contextmanager
 def ready(path: Path) -> Iterator[tuple[Path, "Progress"]]:
     """Yield the file to upload for a path, and the callback for its progress; a bag folder becomes one file."""
-    from skills.formats.upload import find_bag, ready_to_send
+    from skills.formats.upload import find_bag, prepare_upload
 
     bag = find_bag(path)
     read = 0
@@ -192,7 +192,7 @@ def ready(path: Path) -> Iterator[tuple[Path, "Progress"]]:
             read += count
             reading(read, bag.size_bytes)
 
-        with ready_to_send(bag, advance) as file, bar("sending") as sending:
+        with prepare_upload(bag, advance) as file, bar("sending") as sending:
             yield file, sending
 
 

@@ -98,10 +98,11 @@ def _stored(listing: str) -> list[str]:
     if settings().server or (file != url and not Path(file).is_file()):
         return []
     from skills.db.session import Database
-    from skills.library.people import catalogue
+    from skills.library.people import surgeons, suture_types
 
+    of = surgeons if listing == "list_surgeons" else suture_types
     with closing(Database(url, patience_ms=int(LIMIT_S * 1000))) as database, database.reading() as session:
-        return [row.slug for row in getattr(catalogue, listing)(session, MOST, None)]
+        return [row.slug for row in getattr(of, listing)(session, MOST, None)]
 
 
 if TYPE_CHECKING:

@@ -136,7 +136,7 @@ def try_bag(
         "hysteresis": hysteresis,
         "psm_m": psm_m_of(approach, base),
     }
-    teller = _Teller(context, as_json)
+    teller = _Parser(context, as_json)
     with _place(folder, teller) as settings, connect(settings, workers=1) as client:
         _ensure_surgeon(client, surgeon)
         table = column, rate_hz, frame, unit, decimal, table_arm, instrument
@@ -155,7 +155,7 @@ def try_bag(
 
 
 @contextmanager
-def _place(folder: Path | None, teller: "_Teller") -> "Iterator[Settings]":
+def _place(folder: Path | None, teller: "_Parser") -> "Iterator[Settings]":
     """Yield the settings with the database of a folder, of the configured installation, or of a temporary folder."""
     from skills.settings import settings
 
@@ -190,7 +190,7 @@ def _ensure_surgeon(client: "Client", surgeon: str) -> None:
         client.put_surgeon(surgeon)
 
 
-def _tried(client: "Client", teller: "_Teller", job: "Job") -> "Job":
+def _tried(client: "Client", teller: "_Parser", job: "Job") -> "Job":
     """Wait for a try, and print each step as it is done; return the job, also one that failed."""
     from skills.client import JobFailed
 
@@ -234,7 +234,7 @@ def _tissue(text: str) -> float | str:
         raise BadInput(f"--tissue {text!r} is neither a height in mm nor none.", "Example: --tissue=-165") from None
 
 
-class _Teller:
+class _Parser:
     """Prints the steps of a try, its questions, and the commands that answer them or apply a remedy."""
 
     def __init__(self, context: typer.Context, as_json: bool) -> None:

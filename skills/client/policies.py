@@ -101,7 +101,7 @@ class Jobs(Connection):
             depth_along: The direction in which depth increases, of a demonstration in another frame than its arm's
                 base; of equally short ways the policy takes the shallower one.
             scene: What must not be touched, as `Scene.as_json` writes it; the learner's `slip` counts in it.
-            scene_costs: Costs of the scene by name; default: those of `skills.gridworld.scene.SceneCosts`.
+            scene_costs: Costs of the scene by name; default: those of `skills.gridworld.hazards.SceneCosts`.
         """
         asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
         how = None if combine is None else {"kind": combine}
@@ -548,7 +548,7 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     from skills.learning.policy import Policy as LearntPolicy
     from skills.learning.policy import learner_of
     from skills.learning.q_learning import Training
-    from skills.learning.ties import ShortestWay
+    from skills.learning.ties import ShortestApproach
 
     grid = GridWorld(**{name: about["grid"][name] for name in ("origin_mm", "cell_mm", "shape")})
     shown = about.get("combined") or demo["report"] | {"hysteresis": demo["hysteresis"]}
@@ -561,6 +561,6 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
         q[domain.certified] = sent["q"]
         network = Network(sent["network"].tobytes()) if "network" in sent else None
     levels, training = RewardLevels(**about["reward_levels"]), Training(**about["training"])
-    ties = ShortestWay(**about["ties"]) if about.get("ties") else None
+    ties = ShortestApproach(**about["ties"]) if about.get("ties") else None
     there = Surroundings.of_json(about["scene"]) if about.get("scene") else None
     return LearntPolicy(path, levels, learner, about["seed"], training, q, network, ties, there)

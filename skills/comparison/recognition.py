@@ -279,7 +279,7 @@ class Validated:
         right: Number of demonstrations that were recognised.
         settings: The settings chosen on all demonstrations.
         temperature: That of all demonstrations.
-        telling: Two numbers of the logistic function of the logarithm of the distance that tells strangers.
+        stranger_fit: Two numbers of the logistic function of the logarithm of the distance that tells strangers.
         log_loss: Mean of -log p of the true surgeon, in nat.
     """
 
@@ -292,7 +292,7 @@ class Validated:
     right: int
     settings: MetricSettings
     temperature: float
-    telling: Floats
+    stranger_fit: Floats
     log_loss: float
 
     def __post_init__(self) -> None:
@@ -382,7 +382,7 @@ def validate(
         away = fit(*kept, len(labels), chosen).away(signatures[out])
         probability[out] = probabilities(away, its_temperature)
     of_truth = probability[tested, truth[tested]]
-    known, unknown, telling = _tell_strangers(signatures, truth, sessions, recordings, tested, settings)
+    known, unknown, stranger_fit = _fit_strangers(signatures, truth, sessions, recordings, tested, settings)
     return Validated(
         surgeons=labels,
         tested=tested,
@@ -393,7 +393,7 @@ def validate(
         right=int((probability[tested].argmax(axis=1) == truth[tested]).sum()),
         settings=settings,
         temperature=temperature,
-        telling=telling,
+        stranger_fit=stranger_fit,
         log_loss=float(-np.log(of_truth.clip(LEAST)).mean()),
     )
 
@@ -433,7 +433,7 @@ def recognise(
     metric = fit(signatures[other], truth, len(validated.surgeons), validated.settings)
     near = np.log(metric.nearest(signatures[recordings == recordings[one]]).clip(NEAREST)).mean()
     probability = probabilities(metric.away(signatures[[one]]), validated.temperature)[0]
-    return np.asarray(probability), float(_logistic(validated.telling, near))
+    return np.asarray(probability), float(_logistic(validated.stranger_fit, near))
 
 
 def vote(probability: Floats) -> Floats:
@@ -452,7 +452,7 @@ def vote(probability: Floats) -> Floats:
 # ---- strangers -----------------------------------------------------------------------------------------------------
 
 
-def _tell_strangers(
+def _fit_strangers(
     signatures: Floats, truth: Ints, sessions: Ints, recordings: Ints, tested: Ints, settings: MetricSettings
 ) -> tuple[Floats, Floats, Floats]:
     """Return the probability of being a stranger of the tested demonstrations, of all as strangers, and the function.
@@ -474,9 +474,9 @@ def _tell_strangers(
     known, unknown = np.empty(len(near)), np.empty(len(strange))
     for one in range(surgeons):
         of_known, of_unknown = truth[tested] == one, truth == one
-        telling = _fit_logistic(near[~of_known], strange[~of_unknown], surgeons)
-        known[of_known] = _logistic(telling, near[of_known])
-        unknown[of_unknown] = _logistic(telling, strange[of_unknown])
+        stranger_fit = _fit_logistic(near[~of_known], strange[~of_unknown], surgeons)
+        known[of_known] = _logistic(stranger_fit, near[of_known])
+        unknown[of_unknown] = _logistic(stranger_fit, strange[of_unknown])
     return known, unknown, _fit_logistic(near, strange, surgeons)
 
 
@@ -511,8 +511,8 @@ def _fit_logistic(known: Floats, unknown: Floats, surgeons: int) -> Floats:
     return np.array([found[0] - found[1] * middle, found[1]])
 
 
-def _logistic(telling: Floats, x: Floats | float) -> Floats:
-    return np.asarray(1.0 / (1.0 + np.exp(-(telling[0] + telling[1] * x))))
+def _logistic(stranger_fit: Floats, x: Floats | float) -> Floats:
+    return np.asarray(1.0 / (1.0 + np.exp(-(stranger_fit[0] + stranger_fit[1] * x))))
 
 
 # ---- choice of the settings ----------------------------------------------------------------------------------------
@@ -531,11 +531,11 @@ def folds_of(sessions: Ints, truth: Ints, folds: int) -> Ints:
     """
     names, session = np.unique(sessions, return_inverse=True)
     folds = min(folds, len(names))
-    whose = np.zeros((len(names), int(truth.max()) + 1))
-    whose[session, truth] = 1.0
-    there = np.zeros((folds, whose.shape[1]))  # sessions of each surgeon in each group
+    surgeons_of = np.zeros((len(names), int(truth.max()) + 1))
+    surgeons_of[session, truth] = 1.0
+    there = np.zeros((folds, surgeons_of.shape[1]))  # sessions of each surgeon in each group
     of = np.empty(len(names), np.int64)
-    for one, mine in enumerate(whose):
+    for one, mine in enumerate(surgeons_of):
         of[one] = np.lexsort((there.sum(axis=1), there @ mine))[0]
         there[of[one]] += mine
     return of[session]

@@ -29,7 +29,7 @@ from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from skills.comparison.distances import Measured
-from skills.db import Base, Number, RowId, Sha256, Slug, now, partial_index
+from skills.db import AsJson, Base, Number, RowId, Sha256, Slug, now, partial_index
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import Pause
@@ -43,25 +43,28 @@ from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import Training
-from skills.learning.ties import ShortestWay
+from skills.learning.ties import ShortestApproach
 from skills.learning.tube import CertifiedPoses
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
-from skills.packing import few_numbers
+from skills.packing import store_as_palette
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
 from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.planning.trajectory import Trajectory
+from skills.schemas.demos import ChosenSegment, DemoReport
+from skills.schemas.people import Consent
+from skills.schemas.recordings import RecordingContent, TableIn
 from skills.verification.playback import Pictures, Playback
 
-stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
+stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestApproach)
 stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
 stored(PosePath, PartnerMotion, TubeLimits, TubeCertificate)
 stored(Trajectory, OtherArm, Poses)
 stored(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
 # A field that is added to one of these after 0.3.0 is released is registered here, with `skills.packing.added_later`.
-few_numbers(Coverage, "share")  # one for each waypoint
-few_numbers(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
+store_as_palette(Coverage, "share")  # one for each waypoint
+store_as_palette(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 
 class Surgeon(Base):
@@ -75,7 +78,7 @@ class Surgeon(Base):
     skill_level: Mapped[str | None]
     handedness: Mapped[str | None]
     protocol: Mapped[str | None]
-    consent: Mapped[dict[str, Any] | None]
+    consent: Mapped[Consent | None] = mapped_column(AsJson(Consent))
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 
@@ -108,7 +111,7 @@ class SutureType(Base):
 
     slug: Mapped[str] = mapped_column(Slug, primary_key=True)
     name: Mapped[str]
-    also_called: Mapped[list[Any]]
+    also_called: Mapped[list[str]] = mapped_column(AsJson(list[str]))
     family: Mapped[str]
     description: Mapped[str] = mapped_column(String(2000))
 
@@ -124,8 +127,8 @@ class StoredRecording(Base):
     media_type: Mapped[str]
     format: Mapped[str]
     integrity: Mapped[str]
-    reading: Mapped[dict[str, Any]]  # arguments of the reader: rate_hz and frame, where the file has none
-    about: Mapped[dict[str, Any]]  # topics, quality, proposed hand-offs
+    reading: Mapped[TableIn] = mapped_column(AsJson(TableIn))
+    about: Mapped[RecordingContent] = mapped_column(AsJson(RecordingContent))
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 
@@ -162,6 +165,11 @@ class ErasedInterval(Base):
     end_s: Mapped[float | None]
 
 
+CHUNK_BYTES = 1 << 20  # of a recording, of its parsed content, and of a dataset
+# Ours: that many bytes are stored in one transaction, for which others wait: on SQLite some 40 ms.
+AT_ONCE_BYTES = 4 * CHUNK_BYTES
+
+
 class RecordingChunk(Base):
     """A chunk of 1 MiB of a recording; it is stored before the row of the recording, and deleted after it."""
 
@@ -182,7 +190,7 @@ class LooseChunks(Base):
 
 
 class ParsedRecording(Base):
-    """A cache of a recording's content as it was read from its bytes (`skills.library.recordings.recordings`).
+    """A cache of a recording's content as it was read from its bytes (`skills.library.recordings.content_cache`).
 
     A row may be deleted at any time; the bytes are then decoded again. `version` is the `READER_VERSION` that read it;
     rows of another version are not used.
@@ -284,7 +292,8 @@ class Demonstration(Base):
     hysteresis: Mapped[float]  # cells
     demo: Mapped[Demo] = mapped_column(Packed(Demo), deferred=True)
     path: Mapped[GridPath] = mapped_column(Packed(GridPath), deferred=True)
-    report: Mapped[dict[str, Any]]
+    report: Mapped[DemoReport] = mapped_column(AsJson(DemoReport))
+    segment: Mapped[ChosenSegment] = mapped_column(AsJson(ChosenSegment))
     created_at: Mapped[datetime] = mapped_column(default=now)
     withdrawn_at: Mapped[datetime | None]
     outcome: Mapped[str | None] = column_property(newest_mark("outcome", row))
@@ -298,6 +307,11 @@ class Demonstration(Base):
         Index("ix_demonstrations_suture", "suture", "row"),
         partial_index("ix_demonstrations_withdrawn", "row", where="withdrawn_at IS NOT NULL"),
     )
+
+    @property
+    def state(self) -> str:
+        """Whether it is active or withdrawn."""
+        return "active" if self.withdrawn_at is None else "withdrawn"
 
     @property
     def failed(self) -> bool:

@@ -26,6 +26,7 @@ from skills.db import Base, Number, RowId, Sha256, now, partial_index
 from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
 from skills.schemas.operation import JobState
+from skills.settings import Role
 
 LONGEST_REASON = 2000  # characters
 
@@ -181,7 +182,7 @@ class Key(Base):
     id: Mapped[str] = mapped_column(String(16), unique=True)
     digest: Mapped[str] = mapped_column(Sha256)
     owner: Mapped[str] = mapped_column(String(64))
-    role: Mapped[str] = mapped_column(String(10))
+    role: Mapped[Role] = mapped_column(String(10))
     restricted: Mapped[bool]
     created_at: Mapped[datetime] = mapped_column(default=now)
     created_by: Mapped[str]

@@ -21,7 +21,7 @@ from skills.learning import policy as table
 from skills.learning.networks import DDPG, DQN, TRPO, Deep, Network, network_q
 from skills.learning.policy import Learner, Policy, check_learnable
 from skills.learning.q_learning import Training
-from skills.learning.ties import REMOTE_CENTRE, ShortestWay
+from skills.learning.ties import REMOTE_CENTRE, ShortestApproach
 from skills.packing import known
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
@@ -88,7 +88,7 @@ def learn_policy(
     learner: Learner,
     seed: int = 0,
     *,
-    ties: ShortestWay | None = REMOTE_CENTRE,
+    ties: ShortestApproach | None = REMOTE_CENTRE,
     tell: Tell | None = None,
     timeout_s: float = TIMEOUT_S,
     memory_bytes: int = MEMORY_BYTES,

@@ -362,11 +362,11 @@ def not_following(recording: Recording, arm: str) -> list[Nanoseconds]:
     Returns:
         Start and end of each interval in ns; the end is `FOREVER_NS` if the arm was not driven again.
     """
-    told = [signal for name, signal in recording.following if name.rsplit("_", 1)[-1] == arm and len(signal.values)]
-    if not any((signal.values == 1).any() for signal in told):
+    signals = [signal for name, signal in recording.following if name.rsplit("_", 1)[-1] == arm and len(signal.values)]
+    if not any((signal.values == 1).any() for signal in signals):
         return []
-    stamps_ns = np.unique(np.concatenate([signal.stamps_ns for signal in told]))
-    stopped = np.all([_says_no(signal, stamps_ns) for signal in told], axis=0)
+    stamps_ns = np.unique(np.concatenate([signal.stamps_ns for signal in signals]))
+    stopped = np.all([_not_following_at(signal, stamps_ns) for signal in signals], axis=0)
     edges = np.diff(np.concatenate(([False], stopped, [False])).astype(np.int8))
     until_ns = np.append(stamps_ns, FOREVER_NS)
     spans = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
@@ -412,7 +412,7 @@ def is_driven(stamps_ns: Ints, pauses: list[tuple[int, int, Cause]]) -> Flags:
     return ~covered(len(stamps_ns), firsts, ends)
 
 
-def _says_no(following: Signal, stamps_ns: Ints) -> Flags:
+def _not_following_at(following: Signal, stamps_ns: Ints) -> Flags:
     """Return for each stamp, (T,), whether the last message of a teleoperation was that it does not follow."""
     last = np.searchsorted(following.stamps_ns, stamps_ns, side="right") - 1
     return np.asarray((last >= 0) & (following.values[last] != 1))

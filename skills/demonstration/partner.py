@@ -19,7 +19,7 @@ same distance between the tips, which need not be the true one: the frames of th
 not at all, and then only the lengths of their movements are compared.
 
 The confidence is the logistic function of a sum over these observations. Its weights were fitted to synthetic
-sessions with known transfers (`tests/demonstration/test_transfers.py`), and not to surgeons. All of this is ours.
+sessions with known transfers (`tests/demonstration/test_partner.py`), and not to surgeons. All of this is ours.
 """
 
 from collections.abc import Mapping, Sequence

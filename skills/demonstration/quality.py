@@ -203,7 +203,7 @@ def _advice(report: MotionReport, *, has_jaw: bool) -> tuple[str, ...]:
     if report.idle_share > IDLE_SHARE:
         said.append(f"The needle rests for {report.idle_share:.0%} of the time: cut away the idle start and end.")
     if report.clutch_presses > 0:
-        times = times_in_words(report.clutch_presses)
+        times = describe_count(report.clutch_presses)
         said.append(f"You clutched {times}: set up the masters so that the hand-off fits into one sweep.")
     if (seconds := (report.undriven_s or 0.0) - (report.clutched_s or 0.0)) > 0:
         said.append(f"Teleoperation did not follow for {seconds:.1f} s: engage the masters before the hand-off.")
@@ -230,7 +230,7 @@ def _advice(report: MotionReport, *, has_jaw: bool) -> tuple[str, ...]:
     return tuple(said)
 
 
-def times_in_words(count: int) -> str:
+def describe_count(count: int) -> str:
     """Return a count in words.
 
     Args:

@@ -110,13 +110,13 @@ def _of_gestures(labels: Sequence[Label]) -> Iterator[Named]:
     for number, pull in enumerate(gestures):
         if pull.name != PULL:
             continue
-        last, heard = pull, [PULL]
+        last, shared = pull, [PULL]
         for one in gestures[number + 1 : number + 3]:
             if one.name not in (ORIENT, PASS_ON) or last.name == PASS_ON or one.start_ns - last.end_ns > FOLLOWS_NS:
                 break
-            last, heard = one, [*heard, one.name]
-        if len(heard) > 1:
-            words = f"the gestures {', '.join(heard)} were transcribed"
+            last, shared = one, [*shared, one.name]
+        if len(shared) > 1:
+            words = f"the gestures {', '.join(shared)} were transcribed"
             yield Named("gesture", pull.start_ns, last.end_ns, pull.end_ns, words)
 
 
@@ -168,26 +168,8 @@ class Segment:
         return "; ".join(self.reasons)
 
 
-@schema
-@dataclass(frozen=True)
-class TakenSegment:
-    """The part of a recording that a demonstration was cut from, and the reason for this choice.
-
-    Attributes:
-        taken: Such as `proposal 1 of 1`, `the whole recording` or `the given times`.
-        start_s: Its start, in seconds since the recording's `origin_ns`.
-        end_s: Its end.
-        because: The reason in words.
-    """
-
-    taken: str
-    start_s: float
-    end_s: float
-    because: str
-
-
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _Analysed:
     """The motion of one arm in a recording, analysed. Spans are in seconds since `origin_ns`, disjoint and in order."""
 
     recording: Recording
@@ -214,7 +196,7 @@ def propose_segments(recording: Recording, arm: str | None = None) -> tuple[Segm
     Raises:
         NoUsableTopic: There is no such arm, or there are several and none is named.
     """
-    return _proposed(_heard(recording), recording.motion_of(arm=arm))
+    return _proposed(_shared(recording), recording.motion_of(arm=arm))
 
 
 def propose_by_arm(recording: Recording) -> tuple[Segment, ...]:
@@ -226,8 +208,8 @@ def propose_by_arm(recording: Recording) -> tuple[Segment, ...]:
     Returns:
         The proposals arm by arm, those of each in order of time.
     """
-    heard = _heard(recording)
-    return tuple(segment for arm in recording.arms for segment in _proposed(heard, recording.motion_of(arm=arm)))
+    shared = _shared(recording)
+    return tuple(segment for arm in recording.arms for segment in _proposed(shared, recording.motion_of(arm=arm)))
 
 
 def movements_by_arm(recording: Recording) -> tuple[Segment, ...]:
@@ -242,28 +224,30 @@ def movements_by_arm(recording: Recording) -> tuple[Segment, ...]:
     Returns:
         The movements arm by arm, those of each in order of time.
     """
-    heard = _heard(replace(recording, labels=()))
-    return tuple(one for arm in recording.arms for one in _moved(_look(heard, recording.motion_of(arm=arm))))
+    shared = _shared(replace(recording, labels=()))
+    return tuple(one for arm in recording.arms for one in _moved(_analyse(shared, recording.motion_of(arm=arm))))
 
 
-def _proposed(heard: "_Heard", motion: Motion) -> tuple[Segment, ...]:
-    seen = _look(heard, motion)
-    named = _named_passes(seen, heard.named[motion.arm])
+def _proposed(shared: "_Shared", motion: Motion) -> tuple[Segment, ...]:
+    seen = _analyse(shared, motion)
+    named = _named_passes(seen, shared.named[motion.arm])
     if named:
-        return tuple(_named(seen, one) for one in named[:PROPOSALS_LIMIT])
-    if heard.transfers and seen.holding is not None:
-        given = {one.released_s: one for one in heard.transfers if one.giver == motion.arm}
-        return tuple(_given(seen, span, one) for span, one in _last_held(seen, given)[:PROPOSALS_LIMIT])
+        return tuple(_propose_named(seen, one) for one in named[:PROPOSALS_LIMIT])
+    if shared.transfers and seen.holding is not None:
+        given = {one.released_s: one for one in shared.transfers if one.giver == motion.arm}
+        return tuple(
+            _propose_before_transfer(seen, span, one) for span, one in _last_held(seen, given)[:PROPOSALS_LIMIT]
+        )
     return _moved(seen)
 
 
-def _moved(seen: "_Seen") -> tuple[Segment, ...]:
+def _moved(seen: "_Analysed") -> tuple[Segment, ...]:
     if seen.holding is not None:
-        held = _without_hand_work(seen, _held(seen, seen.holding))
-        return tuple(_told(seen, span, "jaw") for span in held[:PROPOSALS_LIMIT])
+        held = _without_hand_work(seen, _movements_in_hold(seen, seen.holding))
+        return tuple(_propose(seen, span, "jaw") for span in held[:PROPOSALS_LIMIT])
     turned = [span for span in _strokes(seen) if _ends_with_a2(seen, span)]
     spans = turned or [span for span in _bridged(_listed(seen.moving), PAUSE_S, seen) if _is_a_pass(seen, span)]
-    return tuple(_told(seen, span, "motion") for span in _without_hand_work(seen, spans)[:PROPOSALS_LIMIT])
+    return tuple(_propose(seen, span, "motion") for span in _without_hand_work(seen, spans)[:PROPOSALS_LIMIT])
 
 
 def arrival(movement: Movement, start_s: float, end_s: float) -> float:
@@ -292,7 +276,7 @@ def arrival(movement: Movement, start_s: float, end_s: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Heard:
+class _Shared:
     """Data of a recording that is computed once and shared by all its arms."""
 
     recording: Recording
@@ -301,17 +285,17 @@ class _Heard:
     transfers: tuple[NeedleTransfer, ...]
 
 
-def _heard(recording: Recording) -> _Heard:
+def _shared(recording: Recording) -> _Shared:
     named: dict[str, list[Named]] = {arm: [] for arm in recording.arms}
     for one in named_hand_offs(recording.labels):
-        named[_whose(recording, one)].append(one)
+        named[_arm_handing_off(recording, one)].append(one)
     closed = {arm: closed_jaw(recording, arm) for arm in recording.arms}
     holding = {arm: None if spans is None else _spans(spans) for arm, spans in closed.items()}
-    return _Heard(recording, named, holding, find_transfers(recording, closed, base_frames(recording)))
+    return _Shared(recording, named, holding, find_transfers(recording, closed, base_frames(recording)))
 
 
-def _look(heard: _Heard, motion: Motion) -> _Seen:
-    recording = heard.recording
+def _analyse(shared: _Shared, motion: Motion) -> _Analysed:
+    recording = shared.recording
     movement = movement_of(recording.seconds(motion.stamps_ns), motion.tip_mm, motion.rotation_xyzw)
     paused = [
         ((start - recording.origin_ns) / 1e9, (end - recording.origin_ns) / 1e9)
@@ -320,14 +304,14 @@ def _look(heard: _Heard, motion: Motion) -> _Seen:
     halted = inside(movement.seconds, paused)
     strokes = _movements(movement, movement.speed_mm_s, movement.moving_mm_s, ~halted)
     turns = _movements(movement, movement.turning_rad_s, TURNING_RAD_S, ~halted)
-    return _Seen(
+    return _Analysed(
         recording=recording,
         motion=motion,
         movement=movement,
         strokes=_spans(strokes),
         moving=_spans(_bridged(sorted(strokes + turns), 0.0)),
-        holding=heard.holding[motion.arm],
-        closes={arm: spans for arm, spans in heard.holding.items() if spans is not None and arm != motion.arm},
+        holding=shared.holding[motion.arm],
+        closes={arm: spans for arm, spans in shared.holding.items() if spans is not None and arm != motion.arm},
         paused_s=np.append(0.0, np.cumsum(np.diff(movement.seconds) * (halted[1:] & halted[:-1]))),
         bases=base_frames(recording),
     )
@@ -348,7 +332,7 @@ def _movements(movement: Movement, speed: Floats, least: float, driven: Flags) -
 # ---- by jaw and motion ------------------------------------------------------------------------------------------
 
 
-def _held(seen: _Seen, holding: Spans) -> list[Span]:
+def _movements_in_hold(seen: _Analysed, holding: Spans) -> list[Span]:
     """Find the movements made while the jaw holds something, none longer than its hold."""
     spans = [
         _exact(seen, group)
@@ -358,7 +342,7 @@ def _held(seen: _Seen, holding: Spans) -> list[Span]:
     return [span for span in spans if _is_a_pass(seen, span)]
 
 
-def _last_held(seen: _Seen, given: Mapping[float, NeedleTransfer]) -> list[tuple[Span, NeedleTransfer]]:
+def _last_held(seen: _Analysed, given: Mapping[float, NeedleTransfer]) -> list[tuple[Span, NeedleTransfer]]:
     """Find the last movement before each transfer that the arm makes with the needle, by the time of its release."""
     assert seen.holding is not None
     found = []
@@ -370,7 +354,7 @@ def _last_held(seen: _Seen, given: Mapping[float, NeedleTransfer]) -> list[tuple
     return found
 
 
-def _strokes(seen: _Seen) -> list[Span]:
+def _strokes(seen: _Analysed) -> list[Span]:
     """Find the movements between rests; a turn in place ends a movement."""
     whole = (float(seen.movement.seconds[0]), float(seen.movement.seconds[-1]))
     bounds = [whole[0], *(end for _, end in _turns_in_place(seen)), whole[1]]
@@ -380,13 +364,13 @@ def _strokes(seen: _Seen) -> list[Span]:
     return [span for span in spans if _is_a_pass(seen, span)]
 
 
-def _turns_in_place(seen: _Seen) -> list[Span]:
+def _turns_in_place(seen: _Analysed) -> list[Span]:
     m = seen.movement
     spans = spans_of(m.seconds, (m.turning_rad_s > TURNING_RAD_S) & (m.speed_mm_s < 2.0 * m.moving_mm_s))
     return [span for span in _bridged(spans, REGRIP_S) if m.turn_rad(*span) >= A2_RAD]
 
 
-def _exact(seen: _Seen, group: Span) -> Span:
+def _exact(seen: _Analysed, group: Span) -> Span:
     """Cut a group of movements to where the tip moves off for good and where its last movement or turn ends."""
     parts = _within(seen.moving, group)
     first, last = 0, len(parts) - 1
@@ -398,15 +382,15 @@ def _exact(seen: _Seen, group: Span) -> Span:
     return off, parts[last][1]
 
 
-def _is_nothing(seen: _Seen, burst: Span) -> bool:
+def _is_nothing(seen: _Analysed, burst: Span) -> bool:
     return seen.movement.extent_mm(*burst) < SHORTEST_MM and seen.movement.turn_rad(*burst) < SMALLEST_TURN_RAD
 
 
-def _is_a_pass(seen: _Seen, span: Span) -> bool:
+def _is_a_pass(seen: _Analysed, span: Span) -> bool:
     return span[1] - span[0] >= SHORTEST_S and seen.movement.extent_mm(*span) >= SHORTEST_MM
 
 
-def _without_hand_work(seen: _Seen, spans: list[Span]) -> list[Span]:
+def _without_hand_work(seen: _Analysed, spans: list[Span]) -> list[Span]:
     if not spans:
         return []
     widths = [seen.movement.extent_mm(*span) for span in spans]
@@ -415,14 +399,14 @@ def _without_hand_work(seen: _Seen, spans: list[Span]) -> list[Span]:
     return [span for span, mm in zip(spans, widths, strict=True) if mm >= least]
 
 
-def _ends_with_a2(seen: _Seen, span: Span) -> bool:
+def _ends_with_a2(seen: _Analysed, span: Span) -> bool:
     """Return whether the instrument hardly turns until the tip has come to rest, and turns after it."""
     rest = arrival(seen.movement, *span)
     before, after = seen.movement.turn_rad(span[0], rest), seen.movement.turn_rad(rest, span[1])
     return after >= A2_RAD and before <= A1_SHARE * after
 
 
-def _bridged(spans: list[Span], pause_s: float, seen: _Seen | None = None) -> list[Span]:
+def _bridged(spans: list[Span], pause_s: float, seen: _Analysed | None = None) -> list[Span]:
     """Join neighbours whose gap is shorter than `pause_s`, or in whose gap the arm was mostly not driven."""
     joined: list[Span] = []
     for start, end in spans:
@@ -433,7 +417,7 @@ def _bridged(spans: list[Span], pause_s: float, seen: _Seen | None = None) -> li
     return joined
 
 
-def _mostly_paused(seen: _Seen, start: float, end: float) -> bool:
+def _mostly_paused(seen: _Analysed, start: float, end: float) -> bool:
     paused_s = seen.paused_s[seen.movement.index(end)] - seen.paused_s[seen.movement.index(start)]
     return bool(paused_s >= PAUSED_SHARE * (end - start))
 
@@ -457,7 +441,7 @@ def _listed(spans: Spans) -> list[Span]:
 # ---- proposals and their reasons --------------------------------------------------------------------------------
 
 
-def _told(seen: _Seen, span: Span, found_by: FoundBy) -> Segment:
+def _propose(seen: _Analysed, span: Span, found_by: FoundBy) -> Segment:
     """Return a span as a proposal, with its reasons."""
     handover = arrival(seen.movement, *span)
     what = "the tip moves with the jaw closed" if found_by == "jaw" else "the tip moves"
@@ -465,16 +449,16 @@ def _told(seen: _Seen, span: Span, found_by: FoundBy) -> Segment:
     return _segment(seen, span, handover, found_by, reasons)
 
 
-def _given(seen: _Seen, span: Span, transfer: NeedleTransfer) -> Segment:
+def _propose_before_transfer(seen: _Analysed, span: Span, transfer: NeedleTransfer) -> Segment:
     """Return the movement before a transfer as a proposal, with its reasons."""
-    told = _told(seen, span, "jaw")
+    proposed = _propose(seen, span, "jaw")
     both_s = max(0.0, transfer.released_s - transfer.taken_s)
     words = f"{transfer.taker} takes the needle: both jaws are closed for {both_s:.1f} s, and the tips keep together"
-    reasons = (*told.reasons, words)
-    return replace(told, found_by="transfer", reasons=reasons, confidence=round(transfer.confidence, 4))
+    reasons = (*proposed.reasons, words)
+    return replace(proposed, found_by="transfer", reasons=reasons, confidence=round(transfer.confidence, 4))
 
 
-def _named(seen: _Seen, one: Named) -> Segment:
+def _propose_named(seen: _Analysed, one: Named) -> Segment:
     """Return a labelled hand-off as a proposal; if the end of A1 is not labelled, it is the time of `arrival`."""
     span, last = _seconds_of(seen, one), float(seen.movement.seconds[-1])
     if one.handover_ns is None:
@@ -485,26 +469,26 @@ def _named(seen: _Seen, one: Named) -> Segment:
     return _segment(seen, span, handover, one.kind, reasons)
 
 
-def _segment(seen: _Seen, span: Span, handover: float, found_by: FoundBy, reasons: Sequence[str]) -> Segment:
+def _segment(seen: _Analysed, span: Span, handover: float, found_by: FoundBy, reasons: Sequence[str]) -> Segment:
     start, end, handover = (round(second, 6) for second in (*span, handover))
     return Segment(seen.motion.arm, start, end, handover, found_by, tuple(reasons))
 
 
-def _seconds_of(seen: _Seen, one: Named) -> Span:
+def _seconds_of(seen: _Analysed, one: Named) -> Span:
     """Return the span of a labelled hand-off in seconds, clipped to the motion."""
     first, last = float(seen.movement.seconds[0]), float(seen.movement.seconds[-1])
     origin_ns = seen.recording.origin_ns
     return max(first, (one.start_ns - origin_ns) / 1e9), min(last, (one.end_ns - origin_ns) / 1e9)
 
 
-def _whose(recording: Recording, one: Named) -> str:
+def _arm_handing_off(recording: Recording, one: Named) -> str:
     """Return the arm that hands off: of several, the one that moves furthest before the handover (labels name none)."""
     until_ns = one.end_ns if one.handover_ns is None else one.handover_ns
     ways = {arm: _way_mm(recording.motion_of(arm=arm), one.start_ns, until_ns) for arm in recording.arms}
     return max(ways, key=lambda arm: ways[arm])
 
 
-def _named_passes(seen: _Seen, named: Sequence[Named]) -> list[Named]:
+def _named_passes(seen: _Analysed, named: Sequence[Named]) -> list[Named]:
     """Select the labelled hand-offs that are a pass, up to a total length of `OVERLAP_LIMIT` times the motion's."""
     left_s, taken = OVERLAP_LIMIT * float(seen.movement.seconds[-1] - seen.movement.seconds[0]), []
     for one in named:
@@ -525,14 +509,14 @@ def _way_mm(motion: Motion, start_ns: int, end_ns: int) -> float:
     return float(np.ptp(tip_mm, axis=0).max()) if len(tip_mm) else 0.0
 
 
-def _pauses(seen: _Seen, span: Span) -> list[str]:
+def _pauses(seen: _Analysed, span: Span) -> list[str]:
     count = len(_within(seen.moving, span)) - 1
     if count < 1:
         return []
     return [f"{count} short or clutched pause{'s belong' if count > 1 else ' belongs'} to it"]
 
 
-def _grip(seen: _Seen, span: Span) -> list[str]:
+def _grip(seen: _Analysed, span: Span) -> list[str]:
     """Return the times of the jaw's grip and release around the movement, in words, if the recording covers them."""
     whole = seen.recording.seconds(seen.motion.stamps_ns[[0, -1]])
     hold = None if seen.holding is None else seen.holding[bisect_left(seen.holding[:, 1], span[1]) :][:1]
@@ -546,14 +530,14 @@ def _grip(seen: _Seen, span: Span) -> list[str]:
     return said
 
 
-def _a2(seen: _Seen, span: Span, handover: float) -> list[str]:
+def _a2(seen: _Analysed, span: Span, handover: float) -> list[str]:
     """Return the transition from A1 to A2, in words."""
     rest = f"the tip comes to rest at {handover:.1f} s"
     turned = seen.movement.turn_rad(handover, span[1])
     return [f"{rest}, then the jaw turns by {np.degrees(turned):.0f} degrees in place" if turned >= A2_RAD else rest]
 
 
-def _taken(seen: _Seen, span: Span) -> list[str]:
+def _taken(seen: _Analysed, span: Span) -> list[str]:
     """Return the other arms that close their jaws at the end, in words, with the distance if it can be determined."""
     said = []
     for arm, closed in seen.closes.items():
@@ -563,7 +547,7 @@ def _taken(seen: _Seen, span: Span) -> list[str]:
     return said
 
 
-def _nearness(seen: _Seen, arm: str, second: float) -> str:
+def _nearness(seen: _Analysed, arm: str, second: float) -> str:
     partner = partner_at(seen.recording, seen.motion, second, seen.bases, arm)
     if partner is None:
         return ""

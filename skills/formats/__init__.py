@@ -22,7 +22,7 @@ from skills.formats.extract import is_extract, read_extract
 from skills.formats.jigsaws import looks_like_kinematics, read_jigsaws
 from skills.formats.mcap import MAGIC
 from skills.formats.rosbag import DB3_MAGIC, ROS1_MAGIC, read_rosbag
-from skills.formats.tables import TableReading, read_table
+from skills.formats.tables import ReadingOptions, read_table
 from skills.remedies import Action, Remedy
 
 __all__ = ["BYTES", "MEDIA_TYPES", "READABLE", "SUFFIXES", "media_type_of", "read_recording", "write_bag", "write_mcap"]
@@ -62,7 +62,7 @@ class FileFormat:
     media_type: str
     suffix: str
     name: str
-    read: Callable[[BinaryIO, TableReading], Recording]
+    read: Callable[[BinaryIO, ReadingOptions], Recording]
     magic: bytes = b""
     is_text: Callable[[str], bool] = lambda _: False
     is_stated: bool = False
@@ -72,13 +72,13 @@ class FileFormat:
         return bool(self.magic) and (head.startswith(self.magic) or self.magic.startswith(head))
 
 
-def _read_columns(file: BinaryIO, stated: TableReading) -> Recording:
+def _read_columns(file: BinaryIO, options: ReadingOptions) -> Recording:
     """Read a table with a header of names: an ee_csv, unless the caller maps its columns, or of one arm."""
     with open_text(file) as text:
         names, _ = header_of(text)
     file.seek(0)
-    read = read_ee_csv if not stated.column and is_header(names) else read_table
-    return read(file, stated)
+    read = read_ee_csv if not options.column and is_header(names) else read_table
+    return read(file, options)
 
 
 # A new format is one more entry here; the first that fits is taken.
@@ -88,7 +88,7 @@ FORMATS = (
         ZIP,
         ".zip",
         "a bag folder, an episode of LeRobot or a trial of JIGSAWS, zipped",
-        lambda file, stated: read_zip(file, stated.frame),
+        lambda file, options: read_zip(file, options.frame),
         archive.MAGIC,
     ),
     FileFormat(TABLE, ".csv", "a table", lambda file, _: read_extract(file), is_text=is_extract),
@@ -138,12 +138,12 @@ def read_recording(
         BadRecording: It is of a supported format and cannot be used; `skills.errors` has the subclasses.
         BadSettings: An argument is impossible, or was given for a recording that says itself what it states.
     """
-    stated = TableReading(rate_hz, frame, tuple(column), tuple(unit), decimal, table_arm, instrument, untimed)
+    options = ReadingOptions(rate_hz, frame, tuple(column), tuple(unit), decimal, table_arm, instrument, untimed)
     found = format_of(file)
-    for field in fields(stated) if not found.is_stated else ():
-        if field.name not in ("frame", "untimed") and getattr(stated, field.name) != field.default:
+    for field in fields(options) if not found.is_stated else ():
+        if field.name not in ("frame", "untimed") and getattr(options, field.name) != field.default:
             raise BadSettings(f"This is {found.name}, which has its own stamps, columns and arms; omit {field.name}.")
-    recording = found.read(file, stated)
+    recording = found.read(file, options)
     own_bases = recording.format == "lerobot" and frame == BASE  # of each arm: PSM1_base, PSM2_base
     return recording if found.is_stated or own_bases else _in_frame(recording, frame)
 

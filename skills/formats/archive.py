@@ -144,9 +144,16 @@ def pack(members: Mapping[str, IO[bytes]], out: IO[bytes]) -> None:
 
 
 def shown(name: str) -> str:
-    """Return a member's name as it may appear in a message: its last component, printable, at most 80 characters."""
-    last = PurePosixPath(name).name or name
-    return repr("".join(letter if letter.isprintable() else "?" for letter in last)[:80])
+    """Return a member's name as it may appear in a message: its last component, quoted."""
+    return repr(printable(PurePosixPath(name).name or name))
+
+
+def printable(value: object, most: int = 80) -> str:
+    """Return text of a file as it may appear in a message: other letters replaced, at most so many.
+
+    JSON may contain unpaired surrogates, which cannot be encoded.
+    """
+    return "".join(letter if letter.isprintable() else "?" for letter in str(value)[:most])
 
 
 def _check_end(file: BinaryIO) -> None:

@@ -61,7 +61,7 @@ from skills.formats.tables import (
     JOINT_NAMES,
     POSITION,
     QUATERNION,
-    TableReading,
+    ReadingOptions,
     check_steps,
     check_time,
     stamps_of,
@@ -91,12 +91,12 @@ def is_header(names: Iterable[str]) -> bool:
     return any(_FIRST.fullmatch(name) for name in names)
 
 
-def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
+def read_ee_csv(file: BinaryIO, options: ReadingOptions) -> Recording:
     """Read the motions of all arms.
 
     Args:
         file: The file, at its beginning.
-        said: What the caller says about it: the frame, and a rate or an instrument where needed.
+        options: What the caller says about it: the frame, and a rate or an instrument where needed.
 
     Returns:
         The recording, in millimetres.
@@ -108,9 +108,9 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
         UnreadableRecording: A row of another length, a cell that is not a number, no rows.
         MixedFrames, NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: See `skills.errors`.
     """
-    if said.table_arm is not None:
+    if options.table_arm is not None:
         raise BadSettings("The columns name their arms; omit table_arm.")
-    if said.unit:
+    if options.unit:
         raise BadSettings("The columns of an ee_csv are in m, rad and ns; omit unit, or map the columns of one arm.")
     check_whole(file)
     with open_text(file) as text:
@@ -119,21 +119,21 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
     if names.count(TIME) > 1:
         raise _doubled(TIME)
     time = names.index(TIME) if TIME in names else None
-    check_time(TIME if time is not None else None, said)
+    check_time(TIME if time is not None else None, options)
     try:
-        stamps_ns, values = _read(file, groups, time, said)
+        stamps_ns, values = _read(file, groups, time, options)
     except SkillsError as error:
         measured = {one: columns for one, columns in groups.items() if one[1] not in SETPOINTS}
         if len(measured) == len(groups):
             raise
-        stamps_ns, values = _read(file, measured, time, said)
+        stamps_ns, values = _read(file, measured, time, options)
         faults |= {topic_of(*one): str(error) for one in groups if one[1] in SETPOINTS}
         groups = measured
-    return _recording(values, stamps_ns, said, _columns(names, groups, time), faults)
+    return _recording(values, stamps_ns, options, _columns(names, groups, time), faults)
 
 
 def _read(
-    file: BinaryIO, groups: Mapping[Quantity, Indices], time: int | None, said: TableReading
+    file: BinaryIO, groups: Mapping[Quantity, Indices], time: int | None, options: ReadingOptions
 ) -> tuple[Ints, dict[Quantity, Parts]]:
     """Return the stamps, shape (T,), and the numbers of each quantity."""
     file.seek(0)
@@ -141,13 +141,13 @@ def _read(
         names, separator = header_of(text)
         apart = {one: [columns] if one[1] in _PARTS else [columns[:3], columns[3:]] for one, columns in groups.items()}
         used = [*([[time]] if time is not None else []), *(list(part) for parts in apart.values() for part in parts)]
-        numbers = read_numbers(text, names, used, separator, said.decimal, None if time is None else (time, "ns"))
+        numbers = read_numbers(text, names, used, separator, options.decimal, None if time is None else (time, "ns"))
     found = iter(numbers.groups)
     if time is not None:
         _check_whole(next(found))
         assert numbers.stamps_ns is not None
         check_steps(TIME, "ns", numbers.stamps_ns)
-    stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, said)
+    stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, options)
     stamps_ns.setflags(write=False)  # so that all streams share it
     values = {one: tuple(next(found) for _ in parts) for one, parts in apart.items()}
     for (_, kind), (first, *others) in values.items():
@@ -169,11 +169,11 @@ def _groups(names: Sequence[str]) -> tuple[dict[Quantity, Indices], dict[str, st
     """
     found: dict[Quantity, dict[int, list[int]]] = {}
     for index, name in enumerate(names):
-        if (said := _USED.fullmatch(name)) is None:
+        if (match := _USED.fullmatch(name)) is None:
             continue
-        kind = _KINDS.get(said["pose"] or said["jaw"], "joints")
-        part = POSE_PARTS.index(said["part"]) if said["part"] else int(said["joint"] or 0)
-        found.setdefault((said["arm"].upper(), kind), {}).setdefault(part, []).append(index)
+        kind = _KINDS.get(match["pose"] or match["jaw"], "joints")
+        part = POSE_PARTS.index(match["part"]) if match["part"] else int(match["joint"] or 0)
+        found.setdefault((match["arm"].upper(), kind), {}).setdefault(part, []).append(index)
     groups, faults = {}, {}
     for quantity, columns in sorted(found.items()):
         try:
@@ -223,7 +223,7 @@ def _check_whole(times: Floats) -> None:
 def _recording(
     values: Mapping[Quantity, Parts],
     stamps_ns: Ints,
-    said: TableReading,
+    options: ReadingOptions,
     columns: tuple[Column, ...],
     faults: Mapping[str, str],
 ) -> Recording:
@@ -239,13 +239,13 @@ def _recording(
             check_joints(topic, positions)
             joints.append(recorded_joints(arm, topic, stamps_ns, positions))
             if (arm, "pose") not in values:
-                pose = posed(topic, positions, said.instrument)
-                computed = pose_motion(arm, kind, base_of(arm, said.frame), stamps_ns, pose)
+                pose = posed(topic, positions, options.instrument)
+                computed = pose_motion(arm, kind, base_of(arm, options.frame), stamps_ns, pose)
                 motions.append(replace(computed, from_joints=True))
         elif kind == "jaw":
             jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
         elif kind == "pose" and arm in posing:
-            motions.append(pose_motion(arm, kind, _frame(arm, posing, said), stamps_ns, parts))
+            motions.append(pose_motion(arm, kind, _frame(arm, posing, options), stamps_ns, parts))
         elif kind == "pose":
             left_out.append((topic, "All its numbers are 0: the arm was not recorded."))
     for (arm, kind), parts in values.items():
@@ -270,7 +270,7 @@ def _recording(
         jaws=tuple(jaws),
         topics=tuple(Topic(name, _KIND, len(stamps_ns)) for name in sorted(here)),
         joints=tuple(joints),
-        tools=() if said.instrument is None else tuple((arm, said.instrument) for arm in arms),
+        tools=() if options.instrument is None else tuple((arm, options.instrument) for arm in arms),
         left_out=(*left_out, *setpoints.left_out),
         columns=columns,
         setpoints=tuple(setpoints.tips),
@@ -278,24 +278,24 @@ def _recording(
     )
 
 
-def _frame(arm: str, arms: Sequence[str], said: TableReading) -> str:
+def _frame(arm: str, arms: Sequence[str], options: ReadingOptions) -> str:
     """Return the frame of an arm's poses, which the caller names.
 
     Raises:
         BadColumns: The caller does not.
         MixedFrames: The caller names the base of one arm for several.
     """
-    if said.frame is None:
+    if options.frame is None:
         raise BadColumns("The table does not say in which frame its poses are.", Remedy(Action.NAME_FRAME))
-    if said.frame == BASE:
+    if options.frame == BASE:
         return f"{arm}_base"
-    if said.frame.endswith("_base") and len(arms) > 1:
+    if options.frame.endswith("_base") and len(arms) > 1:
         raise MixedFrames(
-            f"The poses are of {', '.join(arms)}, and {said.frame!r} is the base of one arm.",
+            f"The poses are of {', '.join(arms)}, and {options.frame!r} is the base of one arm.",
             Remedy(Action.NAME_FRAME),
-            frames=[said.frame],
+            frames=[options.frame],
         )
-    return said.frame
+    return options.frame
 
 
 def _local(arm: str, stamps_ns: Ints, pose: Parts, seen: Motion | None) -> Motion:

@@ -15,7 +15,7 @@ integrity "none".
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -152,7 +152,8 @@ def trials(folder: Path) -> Iterator[Trial]:
         if named is None:
             continue
         home, task = kinematics.parents[2], named["task"]
-        transcription = home / "transcriptions" / kinematics.name
+        transcription, meta = home / "transcriptions" / kinematics.name, home / f"meta_file_{task}.txt"
+        rated = read_meta(meta.read_text(errors="replace")) if meta.is_file() else {}
         yield Trial(
             name=kinematics.stem,
             task=task,
@@ -160,13 +161,8 @@ def trials(folder: Path) -> Iterator[Trial]:
             number=int(named["number"]),
             kinematics=kinematics,
             transcription=transcription if transcription.is_file() else None,
-            rated=_meta_of(home, task).get(kinematics.stem),
+            rated=rated.get(kinematics.stem),
         )
-
-
-def _meta_of(home: Path, task: str) -> Mapping[str, RatedTrial]:
-    meta = home / f"meta_file_{task}.txt"
-    return read_meta(meta.read_text(errors="replace")) if meta.is_file() else {}
 
 
 def _table(file: BinaryIO) -> Floats:

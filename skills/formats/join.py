@@ -29,8 +29,12 @@ def join(parts: Sequence[Recording]) -> Recording:
         return parts[0]
     faults = {topic: why for part in parts for topic, why in part.left_out}  # also if only one part has it
     pedals, clutches = _signals(part.pedals for part in parts), [part.clutch for part in parts if part.clutch]
-    tips = list(_sound(_grouped((part.setpoints for part in parts), _topic), _joined_motion, faults))
-    jaws = list(_sound(_grouped((part.jaw_setpoints for part in parts), _topic_of_signal), _joined_signal, faults))
+    tips = list(
+        _sound(_grouped((part.setpoints for part in parts), lambda motion: motion.topic), _joined_motion, faults)
+    )
+    jaws = list(
+        _sound(_grouped((part.jaw_setpoints for part in parts), lambda pair: pair[1].topic), _joined_signal, faults)
+    )
     first, integrities = parts[0], {part.integrity for part in parts}
     return Recording(
         format=first.format,
@@ -39,7 +43,9 @@ def join(parts: Sequence[Recording]) -> Recording:
         jaws=_signals(part.jaws for part in parts),
         clutch=_clutch(pedals, clutches),
         topics=_topics(part.topics for part in parts),
-        joints=tuple(_joined_joints(one) for _, one in _grouped((part.joints for part in parts), _topic)),
+        joints=tuple(
+            _joined_joints(one) for _, one in _grouped((part.joints for part in parts), lambda joints: joints.topic)
+        ),
         masters=_motions(part.masters for part in parts),
         grippers=_signals(part.grippers for part in parts),
         pedals=pedals,
@@ -57,18 +63,6 @@ def join(parts: Sequence[Recording]) -> Recording:
 def in_time(labels: Iterable[Label]) -> tuple[Label, ...]:
     """Return labels in order of time, without duplicates."""
     return tuple(sorted(set(labels), key=lambda label: (label.start_ns, label.end_ns, label.name)))
-
-
-def _topic(part: Motion | Joints) -> str:
-    return part.topic
-
-
-def _topic_of_signal(part: Named) -> str:
-    return part[1].topic
-
-
-def _name(part: Named) -> str:
-    return part[0]
 
 
 def _grouped(parts: Iterable[Iterable[Part]], key: Callable[[Part], str]) -> list[tuple[str, list[Part]]]:
@@ -92,7 +86,7 @@ def _sound(
 
 
 def _motions(parts: Iterable[Iterable[Motion]]) -> tuple[Motion, ...]:
-    return tuple(_joined_motion(pieces) for _, pieces in _grouped(parts, _topic))
+    return tuple(_joined_motion(pieces) for _, pieces in _grouped(parts, lambda motion: motion.topic))
 
 
 def _joined_motion(pieces: list[Motion]) -> Motion:
@@ -126,7 +120,7 @@ def _joined_joints(pieces: list[Joints]) -> Joints:
 
 
 def _signals(parts: Iterable[Iterable[Named]]) -> tuple[Named, ...]:
-    return tuple(_joined_signal(pieces) for _, pieces in _grouped(parts, _name))
+    return tuple(_joined_signal(pieces) for _, pieces in _grouped(parts, lambda pair: pair[0]))
 
 
 def _joined_signal(pieces: list[Named]) -> Named:

@@ -58,10 +58,9 @@ class ParsedContent:
         vars(self.recording).update(identifications=self.identifications, bases=self.bases)
 
     @property
-    def about(self) -> dict[str, Any]:
-        """The description of the recording for clients, as JSON: a `skills.schemas.recordings.RecordingContent`."""
-        about: dict[str, Any] = json.loads(self.about_json)
-        return about
+    def about(self) -> described.RecordingContent:
+        """The description of the recording for clients."""
+        return described.RecordingContent.model_validate_json(self.about_json)
 
 
 def parse_recording(file: BinaryIO, **options: Any) -> ParsedContent:

@@ -270,7 +270,7 @@ class PassTimes(BaseModel):
     take_back: HandOver | None = None
 
 
-class Timetable(BaseModel):
+class ExecutorTimetable(BaseModel):
     """The passes of a bag on the one clock of its setpoints, for a program or a person that executes it.
 
     Attributes:

@@ -32,7 +32,7 @@ from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Format, Integrity, Recording, Topic
 from skills.errors import BackwardStamps, NoUsableTopic, UnreadableRecording
 from skills.formats import topics
-from skills.formats.archive import refusing
+from skills.formats.archive import printable, refusing
 from skills.formats.bag_writer import Message, write_messages
 from skills.formats.mcap import read_mcap
 from skills.remedies import did_you_mean
@@ -93,10 +93,10 @@ def _check_objects(connection: apsw.Connection) -> None:
     Both SQLite's interpretation of the schema and the schema table in the file are checked.
     """
     found = {name: kind for schema, name, kind, *_ in connection.execute("PRAGMA table_list") if schema == "main"}
-    for kind, shown in (("view", "view"), ("virtual", "virtual table"), ("shadow", "shadow table"), ("table", "table")):
+    for kind, named in (("view", "view"), ("virtual", "virtual table"), ("shadow", "shadow table"), ("table", "table")):
         for name in sorted(name for name, its_kind in found.items() if its_kind == kind):
             if kind != "table" or name not in TABLES | STATISTICS:
-                raise _foreign(shown, name)
+                raise _foreign(named, name)
     for kind, name, table in connection.execute("SELECT type, name, tbl_name FROM main.sqlite_schema"):
         own_index = kind == "index" and (name == INDEX or str(name).startswith("sqlite_autoindex_"))
         if table not in TABLES | STATISTICS or not (own_index or (kind == "table" and name == table)):
@@ -120,9 +120,8 @@ def _check_profiles(connection: apsw.Connection) -> None:
 
 
 def _foreign(kind: str, name: object) -> UnreadableRecording:
-    shown = "".join(letter if letter.isprintable() else "?" for letter in str(name))[:80]
     return UnreadableRecording(
-        f"The SQLite bag (.db3) has a {kind} {shown!r}, which rosbag2 does not write; it is refused. {_ADVICE}",
+        f"The SQLite bag (.db3) has a {kind} {printable(name)!r}, which rosbag2 does not write. {_ADVICE}",
         kind=kind,
     )
 

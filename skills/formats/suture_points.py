@@ -53,18 +53,18 @@ def suture_points(scene: Recording, *, arm: str | None = None, frame: str | None
         MixedFrames: Mark and base are in different frames, or one of them moved.
         NotMetres: A mark is beyond the reach of any arm.
     """
-    marks = sorted((m for m in scene.motions if _MARK.fullmatch(m.arm)), key=lambda m: _order(m.arm))
+    marks = sorted((m for m in scene.motions if _MARK.fullmatch(m.arm)), key=lambda m: _sort_key(m.arm))
     if not marks:
         raise NoUsableTopic(NO_MARKS)
     base = _base_of(scene, arm, frame, marks[0].frame)
     first: dict[Kind, Floats] = {}
     points = []
     for mark in marks:
-        tip, rotation = _steady(mark)
+        tip, rotation = _median_pose(mark)
         if base is not None:
             if mark.frame != base.frame:
                 raise MixedFrames(f"{mark.topic} is in {mark.frame!r} and {base.topic} in {base.frame!r}.")
-            origin, turned = _steady(base)
+            origin, turned = _median_pose(base)
             tip, rotation = (tip - origin) @ turned, turned.T @ rotation
         if not (away_mm := float(np.linalg.norm(tip))) <= REACH_MM:
             raise NotMetres(
@@ -147,7 +147,7 @@ def _base_of(scene: Recording, arm: str | None, frame: str | None, seen_in: str)
     return None
 
 
-def _steady(motion: Motion) -> tuple[Floats, Floats]:
+def _median_pose(motion: Motion) -> tuple[Floats, Floats]:
     """Return the median pose of something that does not move.
 
     Returns:
@@ -172,7 +172,7 @@ def _steady(motion: Motion) -> tuple[Floats, Floats]:
     return np.asarray(place), middle[0]
 
 
-def _order(name: str) -> tuple[int, str]:
+def _sort_key(name: str) -> tuple[int, str]:
     """Sort key: Entry1, Exit1, Entry2 ... by number, entries before exits."""
     found = _MARK.fullmatch(name)
     assert found is not None

@@ -110,7 +110,7 @@ _OTHERS_OF_CALIBRATIONS = re.compile(r"traj_index|(marker|setpoint)_\w+")
 
 
 @dataclass(frozen=True)
-class TableReading:
+class ReadingOptions:
     """Statements about a table that the table itself does not make.
 
     Attributes:
@@ -162,7 +162,7 @@ class _Table:
         return np.stack([self.columns[name] for name in names], axis=1)
 
 
-def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording:
+def read_table(file: BinaryIO, reading: ReadingOptions | None = None) -> Recording:
     """Read one arm's motion from a table.
 
     Args:
@@ -181,54 +181,51 @@ def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording
             cut; without a line end after it, the recording has a note that it may have been.
         NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: As in `skills.demonstration.recording`.
     """
-    said = reading or TableReading()
+    options = reading or ReadingOptions()
     is_ended = ends_with_line(file)
     with open_text(file) as text:
         names, separator = header_of(text)
-        uses = _uses(names, said)
+        uses = _uses(names, options)
         _check_groups(uses)
         time = uses.get("t")
-        check_time(None if time is None else names[time.index], said)
+        check_time(None if time is None else names[time.index], options)
         numbers = read_numbers(
             text,
             names,
             [[use.index] for use in uses.values()],
             separator,
-            said.decimal,
+            options.decimal,
             None if time is None else (time.index, time.unit),
         )
     if not is_ended:
-        check_last_number(file, separator, said.decimal)
-    stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, said)
+        check_last_number(file, separator, options.decimal)
+    stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, options)
     if time is not None and time.unit != "s":
         check_steps(names[time.index], time.unit, stamps_ns)
     columns = {
         name: scaled(found[:, 0], QUANTITIES[name][use.unit])
         for found, (name, use) in zip(numbers.groups, uses.items(), strict=True)
     }
-    recording = _recording(_Table(columns, stamps_ns), said, _listed(names, uses))
+    meant = {use.index: (quantity, use.unit) for quantity, use in uses.items()}
+    listed = tuple(Column(name, *meant.get(index, ("", ""))) for index, name in enumerate(names))
+    recording = _recording(_Table(columns, stamps_ns), options, listed)
     return recording if is_ended else replace(recording, notes=(NOT_ENDED,))
 
 
-def _listed(names: Sequence[str], uses: Mapping[str, _Use]) -> tuple[Column, ...]:
-    quantities = {use.index: (quantity, use.unit) for quantity, use in uses.items()}
-    return tuple(Column(name, *quantities.get(index, ("", ""))) for index, name in enumerate(names))
-
-
-def _recording(table: _Table, said: TableReading, columns: tuple[Column, ...]) -> Recording:
-    arm = said.table_arm or DEFAULT_ARM
+def _recording(table: _Table, options: ReadingOptions, columns: tuple[Column, ...]) -> Recording:
+    arm = options.table_arm or DEFAULT_ARM
     joints = None
     if JOINT_NAMES[0] in table.columns:
         joints = table.stacked(JOINT_NAMES)
         check_joints(TOPIC, joints)
     if POSITION[0] in table.columns:
-        _check_frame(said)
+        _check_frame(options)
         tip_mm, rotation = table.stacked(POSITION), _rotation_xyzw(table)
-        frame = said.frame if said.frame not in (None, BASE) else f"{arm}_base"
+        frame = options.frame if options.frame not in (None, BASE) else f"{arm}_base"
     else:
         assert joints is not None  # `_check_groups`
-        tip_mm, rotation = posed(TOPIC, joints, said.instrument)
-        frame = base_of(arm, said.frame)
+        tip_mm, rotation = posed(TOPIC, joints, options.instrument)
+        frame = base_of(arm, options.frame)
     motion = recorded_motion(
         arm=arm, topic=TOPIC, frame=frame, stamps_ns=table.stamps_ns, tip_mm=tip_mm, rotation_xyzw=rotation
     )
@@ -242,7 +239,7 @@ def _recording(table: _Table, said: TableReading, columns: tuple[Column, ...]) -
         clutch=_signal(table, "clutch", "clutch"),
         topics=(Topic(TOPIC, "text/csv", len(table.stamps_ns)),),
         joints=() if joints is None else (recorded_joints(arm, f"{TOPIC} joints", table.stamps_ns, joints),),
-        tools=() if said.instrument is None else ((arm, said.instrument),),
+        tools=() if options.instrument is None else ((arm, options.instrument),),
         columns=columns,
     )
 
@@ -250,7 +247,7 @@ def _recording(table: _Table, said: TableReading, columns: tuple[Column, ...]) -
 # ---- the meaning of the columns ----------------------------------------------------------------------------------
 
 
-def _uses(names: list[str], said: TableReading) -> dict[str, _Use]:
+def _uses(names: list[str], options: ReadingOptions) -> dict[str, _Use]:
     """Return the columns to read by quantity, in the order of the header.
 
     Raises:
@@ -262,9 +259,10 @@ def _uses(names: list[str], said: TableReading) -> dict[str, _Use]:
             "The table has no header: its first row has numbers. Write the names of the columns above it, separated as "
             f"the numbers are. Known columns: {KNOWN}."
         )
-    units, needed, aliases = _units(said), set[str](), _aliases(names)
-    mapped = _mapped(names, said, units, needed)
-    of_calibration = aliases is not _PAPER_NAMES
+    units, needed = _units(options), set[str]()
+    of_calibration = all(f"measured_{name}" in names for name in JOINT_NAMES)
+    aliases = _CALIBRATION_NAMES if of_calibration else _PAPER_NAMES
+    mapped = _mapped(names, options, units, needed)
     taken, own, unknown = {use.index for use in mapped.values()}, dict[str, _Use](), list[str]()
     for index, name in enumerate(names):
         if index in taken:
@@ -293,11 +291,6 @@ def _uses(names: list[str], said: TableReading) -> dict[str, _Use]:
     return dict(sorted({**mapped, **own}.items(), key=lambda one: one[1].index))
 
 
-def _aliases(names: Sequence[str]) -> Mapping[str, str]:
-    measured = all(f"measured_{name}" in names for name in JOINT_NAMES)
-    return _CALIBRATION_NAMES if measured else _PAPER_NAMES
-
-
 def _named(name: str) -> tuple[str, str]:
     """Split a name such as "x_mm" into quantity and unit; ("", "") for any other, no unit where none is named."""
     if name in QUANTITIES:
@@ -310,10 +303,10 @@ def _full(quantity: str, unit: str) -> str:
     return f"{quantity}_{unit}" if unit else quantity
 
 
-def _mapped(names: list[str], said: TableReading, units: Mapping[int, str], needed: set[str]) -> dict[str, _Use]:
+def _mapped(names: list[str], options: ReadingOptions, units: Mapping[int, str], needed: set[str]) -> dict[str, _Use]:
     """Return the columns that the caller maps, by quantity; raises as `_uses`."""
     mapped: dict[str, _Use] = {}
-    for one in said.column:
+    for one in options.column:
         target, equals, column = one.partition("=")
         quantity, unit = _named(target.strip())
         column = column.strip()
@@ -352,10 +345,10 @@ def _unit_of(quantity: str, unit: str, column: str, units: Mapping[int, str], ne
     return unit or given
 
 
-def _units(said: TableReading) -> dict[int, str]:
+def _units(options: ReadingOptions) -> dict[int, str]:
     """Return the units that the caller gives, by the identity of their dimension."""
     units: dict[int, str] = {}
-    for unit in said.unit:
+    for unit in options.unit:
         dimension = next((one for one in _DIMENSIONS if unit in one), None)
         if dimension is None:
             known = ", ".join(unit for one in _DIMENSIONS for unit in one)
@@ -388,7 +381,10 @@ def _check_groups(uses: Mapping[str, _Use]) -> None:
         if len(units) > 1:  # one in m and another in mm
             missing = [name for name in here if uses[name].unit != first]
         if missing:
-            full = [_full(name, first if group != JOINT_NAMES else _usual(name)) for name in group]
+            full = [
+                _full(name, first if group != JOINT_NAMES else "m" if QUANTITIES[name] is LENGTHS else "rad")
+                for name in group
+            ]
             gone = full[group.index(missing[0])]
             raise BadColumns(f"The table needs all of {', '.join(full)}: {gone} is missing.", missing=missing)
     turns = [group for group in (QUATERNION, RPY, ROTATION_VECTOR) if group[0] in uses]
@@ -398,41 +394,37 @@ def _check_groups(uses: Mapping[str, _Use]) -> None:
         )
 
 
-def _usual(joint: str) -> str:
-    return "m" if QUANTITIES[joint] is LENGTHS else "rad"
-
-
 # ---- what tables of every kind share -----------------------------------------------------------------------------
 
 
-def _check_frame(said: TableReading) -> None:
+def _check_frame(options: ReadingOptions) -> None:
     """Refuse positions under another name without a frame: only our own names mean the base of the arm.
 
     Raises:
         BadColumns: There is none.
     """
-    mapped = {one.partition("=")[0].partition("_")[0] for one in said.column}
-    if said.frame is None and mapped & set(POSITION):
+    mapped = {one.partition("=")[0].partition("_")[0] for one in options.column}
+    if options.frame is None and mapped & set(POSITION):
         raise BadColumns("The table does not say in which frame its positions are.", Remedy(Action.NAME_FRAME))
 
 
-def check_time(column: str | None, said: TableReading) -> None:
+def check_time(column: str | None, options: ReadingOptions) -> None:
     """Refuse a table whose times are given twice or not at all.
 
     Raises:
         BadColumns: There are a column of times and a rate, or neither.
     """
-    if column is not None and said.rate_hz is not None:
+    if column is not None and options.rate_hz is not None:
         raise BadColumns(f"The table has the column {column} and the request has rate_hz; use one of them.")
-    if column is None and said.rate_hz is None and not said.untimed:
+    if column is None and options.rate_hz is None and not options.untimed:
         raise BadColumns("The table has no column t_s, and there is no rate.", Remedy(Action.NAME_RATE))
 
 
-def stamps_of(stamps_ns: Ints | None, count: int, said: TableReading) -> Ints:
+def stamps_of(stamps_ns: Ints | None, count: int, options: ReadingOptions) -> Ints:
     """Return the stamps of a table: its own, those of the rate, or a second per sample where neither is known."""
     if stamps_ns is not None:
         return stamps_ns
-    even: Ints = np.rint(np.arange(count) * (1e9 / (said.rate_hz or 1.0))).astype(np.int64)
+    even: Ints = np.rint(np.arange(count) * (1e9 / (options.rate_hz or 1.0))).astype(np.int64)
     return even
 
 

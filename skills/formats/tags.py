@@ -19,6 +19,7 @@ from typing import Any
 
 from skills.demonstration.recording import Label
 from skills.errors import UnreadableRecording
+from skills.formats.archive import printable
 from skills.formats.join import in_time
 
 TAGS_BYTES = 32 << 20  # per JSON file: the frames of a day of video
@@ -84,8 +85,8 @@ def _label(name: str, stage: Any, stamps: list[Any]) -> Label | None:
     if start is None or end is None:
         return None
     if end < start:
-        raise UnreadableRecording(f"{_short(name)} ends the stage {_printable(stage['name'])!r} before it starts.")
-    return Label(_printable(stage["name"]), "stage", start, end)
+        raise UnreadableRecording(f"{_short(name)} ends the stage {printable(stage['name'])!r} before it starts.")
+    return Label(printable(stage["name"], _NAME_LENGTH), "stage", start, end)
 
 
 def _moment_ns(moment: Any, stamps: list[Any]) -> int | None:
@@ -104,14 +105,6 @@ def _moment_ns(moment: Any, stamps: list[Any]) -> int | None:
 
 def _is_stamp(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and _LATEST_FRAME < value < _LATEST_NS
-
-
-def _printable(name: str) -> str:
-    """Return a stage's name with unprintable characters replaced.
-
-    JSON may contain unpaired surrogates, which cannot be encoded.
-    """
-    return "".join(letter if letter.isprintable() else "?" for letter in name[:_NAME_LENGTH])
 
 
 def _short(name: str) -> str:

@@ -1,6 +1,6 @@
 """Preparing the user's own recordings for upload: finding a bag on disk, and making it small, complete and one file.
 
-    path --find_bag--> Bag --ready_to_send--> the path of the file to send
+    path --find_bag--> Bag --prepare_upload--> the path of the file to send
 
     a file          unchanged; with pictures, a copy without them
     a bag folder    with one file, like that file; with several, joined
@@ -126,7 +126,7 @@ def find_bag(path: Path) -> Bag:
 
 
 @contextmanager
-def ready_to_send(bag: Bag, progress: Progress = ignore) -> Iterator[Path]:
+def prepare_upload(bag: Bag, progress: Progress = ignore) -> Iterator[Path]:
     """Prepare a bag for upload, and yield the path of the file to send.
 
     If the bag has to be rewritten, the file is in a temporary folder that is removed after the block.
@@ -157,7 +157,7 @@ def _one_file(bag: Bag, folder: Path, progress: Progress) -> Path:
         return bag.files[0]
     files = [_plain_file(file, folder) for file in bag.files]
     if len(files) == 1 and files[0] == bag.files[0]:
-        topics = _topics_in(files)
+        topics = topics_of(files[0]) if files[0].suffix == ".mcap" else rosbag.topics_in(files)
         if not any(topic.type in PICTURES for topic in topics):
             _check(bag, topics)
             return files[0]
@@ -165,10 +165,10 @@ def _one_file(bag: Bag, folder: Path, progress: Progress) -> Path:
     out = folder / f"{_NAME}.mcap"
     with out.open("wb") as file:
         if files[0].suffix == ".mcap":
-            notes = origin(digests, (topic for path in files for topic in topics_of(path)))
-            topics = lighten(files, file, notes, progress)
+            notes = notes_of_original(digests, (topic for path in files for topic in topics_of(path)))
+            topics = copy_without_pictures(files, file, notes, progress)
         else:
-            topics = rosbag.convert(files, file, origin(digests, rosbag.topics_in(files)))
+            topics = rosbag.convert(files, file, notes_of_original(digests, rosbag.topics_in(files)))
     _check(bag, topics)
     return out
 
@@ -182,10 +182,6 @@ def _can_be_rewritten(file: Path) -> bool:
         head = content.read(16)
     kinds = {".mcap": MAGIC, ".bag": rosbag.ROS1_MAGIC, ".db3": rosbag.DB3_MAGIC, ".zstd": b"\x28\xb5\x2f\xfd"}
     return file.suffix in kinds and head.startswith(kinds[file.suffix])
-
-
-def _topics_in(files: Sequence[Path]) -> tuple[Topic, ...]:
-    return topics_of(files[0]) if files[0].suffix == ".mcap" else rosbag.topics_in(files)
 
 
 def _check(bag: Bag, topics: Sequence[Topic]) -> None:
@@ -244,7 +240,7 @@ def _digest(path: Path, progress: Progress) -> str:
         return digest_of(file, lambda data: progress(len(data)))
 
 
-def origin(digests: Sequence[str], topics: Iterable[Topic]) -> dict[str, str]:
+def notes_of_original(digests: Sequence[str], topics: Iterable[Topic]) -> dict[str, str]:
     """Return the notes about a copy's original: the SHA-256 of each file, and the topics that were left out."""
     names = ["sha256"] if len(digests) == 1 else [f"sha256 of part {number + 1}" for number in range(len(digests))]
     dropped = dict.fromkeys(f"{topic.name} ({topic.type})" for topic in topics if topic.type in PICTURES)
@@ -273,7 +269,7 @@ def topics_of(path: Path) -> tuple[Topic, ...]:
         raise _unreadable(path, error) from error
 
 
-def lighten(
+def copy_without_pictures(
     paths: Sequence[Path], out: IO[bytes], notes: Mapping[str, str], progress: Progress = ignore
 ) -> tuple[Topic, ...]:
     """Copy MCAP files, one after the other, into one file without pictures.
@@ -281,7 +277,7 @@ def lighten(
     Args:
         paths: The files, in order of time.
         out: The copy.
-        notes: For the copy's metadata record, from `origin`.
+        notes: For the copy's metadata record, from `notes_of_original`.
         progress: Callback, called with numbers of bytes as they are read.
 
     Returns:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any, BinaryIO, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, Field, StrictBool, StrictStr, ValidationError
+from pydantic import AliasPath, BaseModel, Field, StrictBool, StrictStr, ValidationError
 
 from skills.arrays import Flags, Floats, Ints
 from skills.errors import BadBag, Corrupt, UnknownInstrument
@@ -30,13 +30,13 @@ from skills.formats.bag_writer import DEFINITIONS, Written, metadata_of
 from skills.formats.checksums import SUMS, digest_of, read_sums
 from skills.formats.columns import in_mm
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Wanted, fields_of
-from skills.formats.mcap.reader import MessageSchema, Walker
+from skills.formats.mcap.reader import Channel, MessageSchema, Walker
 from skills.formats.replay_bag import (
     CRTK_ARMS,
     ArmMotion,
+    ExecutorTimetable,
     JawMove,
     Role,
-    Timetable,
     arm_names,
     messages_of,
     notes_of,
@@ -79,13 +79,6 @@ class PathPaper(BaseModel):
     path_mm: Annotated[list[tuple[float, float, float]], Field(min_length=1)]
 
 
-class SamplingPaper(BaseModel):
-    """The rate and the number of samples of the plan's motion."""
-
-    rate_hz: float
-    samples: int
-
-
 class OtherArmPaper(BaseModel):
     """PSM_M; without a base it does not move."""
 
@@ -101,7 +94,8 @@ class PlanPaper(BaseModel):
     arm: StrictStr
     frame: StrictStr
     instrument: StrictStr
-    trajectory: SamplingPaper
+    rate_hz: float = Field(validation_alias=AliasPath("trajectory", "rate_hz"))
+    samples: int = Field(validation_alias=AliasPath("trajectory", "samples"))
     passes: Annotated[list[PathPaper], Field(min_length=1)]
     psm_m: OtherArmPaper | None
 
@@ -181,7 +175,7 @@ def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
     _check_statement(statement, papers)
     motions = [_read_arm(archive, name, plan) for name in arms]
     _check_roles(motions, plan)
-    _check_timetable(_paper(archive, EXECUTOR, Timetable), plan, motions)
+    _check_timetable(_paper(archive, EXECUTOR, ExecutorTimetable), plan, motions)
     for motion in motions:
         _check_judged(motion, papers.report)
     return [
@@ -295,7 +289,7 @@ def _read_papers(archive: Archive) -> Papers:
     return Papers(plan, verdict, report, policy)
 
 
-def _check_timetable(timetable: Timetable, plan: PlanPaper, motions: list[ArmMotion]) -> None:
+def _check_timetable(timetable: ExecutorTimetable, plan: PlanPaper, motions: list[ArmMotion]) -> None:
     """Check that the timetable is this plan's, and that both arms have a setpoint at every one of its stamps.
 
     And that jaws are as stated when they have moved, each after the one before.
@@ -311,13 +305,12 @@ def _check_timetable(timetable: Timetable, plan: PlanPaper, motions: list[ArmMot
 
 def _in_order(jaws: list[JawMove], motions: list[ArmMotion]) -> bool:
     """Return whether the jaws move one after the other to the stated angles."""
-    reached = {
-        (motion.name, ns, rad)
-        for motion in motions
-        for ns, rad in zip(motion.stamps_ns.tolist(), motion.jaw_rad.tolist(), strict=True)
-    }
-    stated = all((jaw.arm, jaw.to_ns, jaw.jaw_rad) in reached for jaw in jaws)
-    return stated and all(first.to_ns <= second.from_ns for first, second in pairwise(jaws))
+    arms = {motion.name: motion for motion in motions}
+    for jaw in jaws:
+        motion = arms.get(jaw.arm)
+        if motion is None or jaw.jaw_rad not in motion.jaw_rad[motion.stamps_ns == jaw.to_ns]:
+            return False
+    return all(first.to_ns <= second.from_ns for first, second in pairwise(jaws))
 
 
 # ---- one arm ----------------------------------------------------------------------------------------------------
@@ -370,26 +363,34 @@ def _walk(file: BinaryIO, name: str) -> tuple[Walker, dict[str, _Topic]]:
         f"/{name}/setpoint_cp": _Topic(POSE, WANTED_POSE),
         f"/{name}/jaw/setpoint_js": _Topic(JOINT_STATE, _JOINTS),
     }
-    walker, decoders = Walker(file), dict[str, Decoder]()
-    for part in walker.stretches():
-        topic = part.channel.topic
-        if topic not in topics:
-            raise BadBag(f"{name}.mcap has the topic {topic[:100]!r}, which is not a setpoint topic of {name}.")
-        said, data = topics[topic], part.data
-        if topic not in decoders:
-            schema = walker.schemas.get(part.channel.schema, _UNTYPED)
-            expected = ("cdr", said.type, "ros2msg", DEFINITIONS[said.type].encode())
-            if (part.channel.encoding, schema.name, schema.encoding, schema.definition) != expected:
-                raise BadBag(f"{topic} does not have the type {said.type}. Export the bag again.")
-            decoders[topic] = Decoder(topic, fields_of(schema.name, schema.definition.decode()), said.wanted)
-        said.columns.append(decoders[topic].decode(data, part.begin, part.length))
-        spans = zip(part.begin.tolist(), part.length.tolist(), strict=True)
-        said.messages += [data[begin : begin + length].tobytes() for begin, length in spans]
-        if len(said.messages) > SAMPLES_LIMIT:
-            raise BadBag(f"{topic} has more than {SAMPLES_LIMIT} messages; a plan is never so long.")
+    walker, decoders = Walker(file), dict[int, Decoder]()
+    for part in walker.parts():
+        for number in part.numbers:
+            channel = walker.channels[number]
+            if channel.topic not in topics:
+                raise BadBag(
+                    f"{name}.mcap has the topic {channel.topic[:100]!r}, which is not a setpoint topic of {name}."
+                )
+            said = topics[channel.topic]
+            if number not in decoders:
+                decoders[number] = _decoder(channel, walker.schemas.get(channel.schema, _UNTYPED), said)
+            begin, length = part.of(number)
+            said.columns.append(decoders[number].decode(part.data, begin, length))
+            spans = zip(begin.tolist(), length.tolist(), strict=True)
+            said.messages += [part.data[at : at + size].tobytes() for at, size in spans]
+            if len(said.messages) > SAMPLES_LIMIT:
+                raise BadBag(f"{channel.topic} has more than {SAMPLES_LIMIT} messages; a plan is never so long.")
     if walker.integrity != "full":
         raise BadBag(f"Not every message of {name}.mcap is covered by a checksum. Export the bag again.")
     return walker, topics
+
+
+def _decoder(channel: Channel, schema: MessageSchema, said: _Topic) -> Decoder:
+    """Return the decoder of a channel of exactly the type that is written."""
+    expected = ("cdr", said.type, "ros2msg", DEFINITIONS[said.type].encode())
+    if (channel.encoding, schema.name, schema.encoding, schema.definition) != expected:
+        raise BadBag(f"{channel.topic} does not have the type {said.type}. Export the bag again.")
+    return Decoder(channel.topic, fields_of(schema.name, schema.definition.decode()), said.wanted)
 
 
 def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: PlanPaper) -> ArmMotion:
@@ -553,9 +554,9 @@ def _check_roles(motions: list[ArmMotion], plan: PlanPaper) -> None:
     if (psm_a.pass_index or 0) >= len(plan.passes):
         raise BadBag(f"{psm_a.name} is of a pass that {PLAN} does not have. Export the bag again.")
     goal_mm = plan.passes[-1 if psm_a.pass_index is None else psm_a.pass_index].path_mm[-1]
-    same = (psm_a.instrument, psm_a.rate_hz) == (plan.instrument, plan.trajectory.rate_hz)
+    same = (psm_a.instrument, psm_a.rate_hz) == (plan.instrument, plan.rate_hz)
     others = [] if other is None or other.base_mm is None else [other.instrument]
-    whole = psm_a.pass_index is not None or len(psm_a.stamps_ns) == plan.trajectory.samples
+    whole = psm_a.pass_index is not None or len(psm_a.stamps_ns) == plan.samples
     off_mm = float(np.linalg.norm(1000.0 * psm_a.tip_m[-1] - goal_mm))
     if not (same and whole):
         raise BadBag(f"{psm_a.name} has another instrument, rate or number of samples than {PLAN}.")

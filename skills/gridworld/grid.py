@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from skills.arrays import Floats, Ints, freeze, frozen, xyz
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.quality import times_in_words
+from skills.demonstration.quality import describe_count
 from skills.errors import BadPath, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
 from skills.fields import Count, Fraction, Point, schema
 from skills.gridworld import paper
@@ -466,7 +466,7 @@ def _calming(
     calm_mm = discretisation_rmse(demo.tip_mm, path.grid, CALMING_HYSTERESIS)
     became_mm, was_mm = np.linalg.norm([calm_mm, lost_mm], axis=1)
     return CALMING_HYSTERESIS, (
-        f"The path returns to the cell that it has just left {times_in_words(returns)}, as with a tremor at a "
+        f"The path returns to the cell that it has just left {describe_count(returns)}, as with a tremor at a "
         f"cell face. Request hysteresis {CALMING_HYSTERESIS}: {len(calm.states)} states instead of "
         f"{len(path.states)}, at {became_mm:.1f} instead of {was_mm:.1f} mm.",
     )

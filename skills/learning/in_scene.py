@@ -3,8 +3,8 @@
     RewardMap, Hazards --learn_in_scene--> Policy --certify_in_scene--> SceneCertificate, SceneOdds
 
 The decision process is that of the phase state with slips (`skills.learning.dynamic_programming`), with Algorithm 1's
-rewards, less the costs of the scene (`skills.gridworld.scene.SceneCosts`). A move that touches, intended or by a slip,
-ends the pass at the cost of touching.
+rewards, less the costs of the scene (`skills.gridworld.hazards.SceneCosts`). A move that touches, intended or by a
+slip, ends the pass at the cost of touching.
 
 Gamma must be near 1 here. With 0.1 the reward of finishing, ten moves away, is worth 10^-9, and any risk of touching
 outweighs it: the best policy then stays away from the path. With 0.95 it follows the path from its beginning, because a

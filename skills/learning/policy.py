@@ -27,7 +27,7 @@ from skills.learning.dynamic_programming import ValueIteration, iterate_values
 from skills.learning.max_ent_irl import MaxEntIRL, learn_from_recovered
 from skills.learning.networks import DDPG, DQN, TRPO, Network
 from skills.learning.q_learning import CellQLearning, PhaseQLearning, Training, learn_q
-from skills.learning.ties import REMOTE_CENTRE, ShortestWay, choose
+from skills.learning.ties import REMOTE_CENTRE, ShortestApproach, choose
 from skills.notebook import card
 
 Tabular = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL
@@ -205,7 +205,7 @@ class Policy:
     training: Training
     q: Floats
     network: Network | None = None
-    ties: ShortestWay | None = None
+    ties: ShortestApproach | None = None
     surroundings: Surroundings | None = None
 
     def __post_init__(self) -> None:
@@ -290,7 +290,7 @@ class Policy:
 
 
 def learn_tabular(
-    reward: RewardMap, learner: Tabular, seed: int = 0, ties: ShortestWay | None = REMOTE_CENTRE
+    reward: RewardMap, learner: Tabular, seed: int = 0, ties: ShortestApproach | None = REMOTE_CENTRE
 ) -> Policy:
     """Learn to follow a demonstration from its reward map; the same arguments give the same bytes.
 

@@ -38,7 +38,7 @@ from skills.demonstration.movement import same_signs
 from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, MixedFrames
 from skills.learning.evaluation import dtw
-from skills.quaternions import INVERSE, angle_of, between, dominant, multiplied, of_vector, turned, unit, vector_of
+from skills.quaternions import INVERSE, angle_of, between, mean_rotation, multiplied, of_vector, turned, unit, vector_of
 
 PHASES = 101  # ours: a hundredth of a hand-off of 5 s is a twentieth of a second, in which a hand does not turn back
 # Ours: the steps of a DTW path are no tempo, so it is smoothed by a Gaussian window of standard deviation 3 phases.
@@ -410,18 +410,3 @@ def _turn_at(rotation_xyzw: Floats, places: Floats) -> Floats:
     before = np.minimum(places.astype(np.int64), len(rotation_xyzw) - 2)
     turns = unit(rotation_xyzw)
     return between(turns[before], turns[before + 1], places - before)
-
-
-def mean_rotation(rotation_xyzw: Floats, weights: Floats) -> Floats:
-    """Return the weighted mean orientation at each phase.
-
-    It is the eigenvector of the largest eigenvalue of the weighted sum of outer products, so q and -q are the same.
-
-    Args:
-        rotation_xyzw: Orientations of K demonstrations, unit quaternions, shape (K, P, 4).
-        weights: The weight of each demonstration, shape (K,).
-
-    Returns:
-        Unit quaternions of either sign, shape (P, 4).
-    """
-    return dominant(np.einsum("k,kpi,kpj->pij", weights, rotation_xyzw, rotation_xyzw))

@@ -44,7 +44,7 @@ NM_PER_MM = 1e6
 
 @schema
 @dataclass(frozen=True)
-class ShortestWay:
+class ShortestApproach:
     """The rule among equally good actions: shortest way, then least depth, then earliest joining point, lowest index.
 
     The way is the one to the first waypoint that is entered, and its depth is the greatest of its cells. Depth is not
@@ -58,7 +58,7 @@ class ShortestWay:
 
     depth_from_mm: Point | None = None
     depth_along: Point | None = None
-    kind: Literal["shortest-way"] = "shortest-way"
+    kind: Literal["shortest-approach"] = "shortest-approach"
 
     def __post_init__(self) -> None:
         if self.depth_from_mm is not None and self.depth_along is not None:
@@ -90,10 +90,10 @@ class ShortestWay:
         return np.asarray(np.rint(depth.reshape(-1) * NM_PER_MM), np.int64)
 
 
-REMOTE_CENTRE = ShortestWay(depth_from_mm=(0.0, 0.0, 0.0))  # of a demonstration in the base frame of its arm
+REMOTE_CENTRE = ShortestApproach(depth_from_mm=(0.0, 0.0, 0.0))  # of a demonstration in the base frame of its arm
 
 
-def rule_in(frame: str, depth_along: Sequence[float] | None = None) -> ShortestWay:
+def rule_in(frame: str, depth_along: Sequence[float] | None = None) -> ShortestApproach:
     """Return the rule for a demonstration in a frame.
 
     In the base of an arm, depth is the distance from the remote centre. In another frame it is measured along the given
@@ -108,7 +108,7 @@ def rule_in(frame: str, depth_along: Sequence[float] | None = None) -> ShortestW
     """
     if frame.endswith("_base"):
         return REMOTE_CENTRE
-    return ShortestWay(depth_along=None if depth_along is None else cast(Point, tuple(depth_along)))
+    return ShortestApproach(depth_along=None if depth_along is None else cast(Point, tuple(depth_along)))
 
 
 class Boxes(NamedTuple):
@@ -136,7 +136,7 @@ class Approaches(NamedTuple):
     joined: Ints
 
 
-def choose(domain: Domain, q: Floats, rule: ShortestWay) -> Ints:
+def choose(domain: Domain, q: Floats, rule: ShortestApproach) -> Ints:
     """Return the action of each row by the rule; meaningless in rows without one.
 
     Args:
@@ -159,7 +159,7 @@ def choose(domain: Domain, q: Floats, rule: ShortestWay) -> Ints:
     return action
 
 
-def off_rule(mdp: Mdp, values: Floats, actions: Ints, moves: Moves, rule: ShortestWay) -> int:
+def off_rule(mdp: Mdp, values: Floats, actions: Ints, moves: Moves, rule: ShortestApproach) -> int:
     """Count the rows whose action is not the one that the rule selects of the exactly best ones.
 
     The lengths, depths and joining points are those of the walks by the given actions. The rule holds everywhere if no
@@ -207,7 +207,7 @@ def _ends(domain: Domain) -> tuple[Flags, Ints]:
     return ends, joined
 
 
-def _approaches(domain: Domain, actions: Ints, moves: Moves, rule: ShortestWay) -> Approaches:
+def _approaches(domain: Domain, actions: Ints, moves: Moves, rule: ShortestApproach) -> Approaches:
     """Return the approach that is left on entering each row by given actions.
 
     The walks from all rows are computed at once, by doubling their length.

@@ -1,6 +1,6 @@
 """Passes before they are timed: the stations and paths of both arms, and an arm's joints over all samples.
 
-    PassPath, PsmM --ways--> Way: transfer, A1 and A2 of each pass
+    PassPath, PsmM --lay_out--> Route: transfer, A1 and A2 of each pass
     Poses, Ticks --solve--> joints of every tick
     base of PSM_M, its poses at every tick --other_arm--> OtherArm
 
@@ -234,7 +234,7 @@ class PassPath:
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class Route:
     """The path of the arms in one pass.
 
     Attributes:
@@ -259,7 +259,7 @@ class Way:
         return self.handed or self.brought
 
 
-def ways(passes: Sequence[PassPath], psm_m: PsmM | None) -> list[Way]:
+def lay_out(passes: Sequence[PassPath], psm_m: PsmM | None) -> list[Route]:
     """Lay out every pass, with PSM_M if its base is known.
 
     Args:
@@ -276,7 +276,7 @@ def ways(passes: Sequence[PassPath], psm_m: PsmM | None) -> list[Way]:
     if not passes:
         raise NoMotion("A plan needs at least one pass.")
     beside = psm_m if psm_m is not None and psm_m.base_mm is not None else None
-    found: list[Way] = []
+    found: list[Route] = []
     before: Meeting | None = None
     for number, one in enumerate(passes):
         line = _polyline(one, number)
@@ -286,7 +286,7 @@ def ways(passes: Sequence[PassPath], psm_m: PsmM | None) -> list[Way]:
         if one.target_rotation is not None:
             handed = _arms(Pose(line[-1], one.target_rotation), None if meets is None else meets.taking)
         brought = (Pose(line[-1], one.last_rotation), *stations[-1][1:])
-        found.append(Way(stations, line, brought, handed, one.hand, number > 0))
+        found.append(Route(stations, line, brought, handed, one.hand, number > 0))
         before = meets
     return found
 

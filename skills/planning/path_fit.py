@@ -60,7 +60,7 @@ from skills.errors import BadPlan
 from skills.gridworld.grid import GridPath
 from skills.kinematics import instrument_of, matrix_of, quaternion_of
 from skills.learning.policy import Rollout
-from skills.quaternions import unit
+from skills.quaternions import mean_rotation, unit
 
 TREMOR_S = 0.25  # a Hann window this wide has its zeros at 8, 12, 16 Hz and passes less than 3 % in between
 # Lengths as parts of a cell:
@@ -517,7 +517,7 @@ def styled(followed: Demo, demos: Sequence[Demo]) -> Demo:
         followed: Their combination, whose positions remain.
         demos: The demonstrations; without the orientation of every one, none is returned.
     """
-    from skills.learning.pose_style import learn_pose_style, mean_rotation  # here, because of scipy
+    from skills.learning.pose_style import learn_pose_style  # here, because of scipy
 
     if any(demo.rotation_xyzw is None for demo in demos):
         return replace(followed, rotation_xyzw=None)

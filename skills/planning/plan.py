@@ -60,7 +60,7 @@ from skills.learning.policy import Policy, rollout
 from skills.notebook import card
 from skills.planning.handoff import PsmM, needle_tips_mm, realign
 from skills.planning.motion_laws import Pose, followed
-from skills.planning.passes import PassPath, Way, ways
+from skills.planning.passes import PassPath, Route, lay_out
 from skills.planning.path_fit import SmoothedDemo, ends_of, fit_to_demo, hand_along, moved, trace
 from skills.planning.trajectory import Trajectory, time_parametrise
 
@@ -530,7 +530,7 @@ def driven_pass(policy: Policy, demo: Demo) -> DrivenPass:
     """
     plan = _at_its_own_place(policy, demo)
     (only,) = plan.passes
-    (way,) = ways(plan.passes, None)
+    (way,) = lay_out(plan.passes, None)
     line, rotation = _driven(way, only.rotation)
     nearest, beyond = nearest_limit(line, rotation, demo.instrument)
     return DrivenPass(
@@ -544,7 +544,7 @@ def driven_pass(policy: Policy, demo: Demo) -> DrivenPass:
     )
 
 
-def _driven(way: Way, held: Floats) -> tuple[Floats, Floats]:
+def _driven(way: Route, held: Floats) -> tuple[Floats, Floats]:
     """Return the places of A1, (N, 3) mm, and the jaw's rotation there: (N, 3, 3), or the (3, 3) that is held."""
     if way.hand is None:
         return followed(way.line, STEP_MM)[0], held

@@ -57,7 +57,7 @@ from skills.planning.motion_laws import (
     joined,
     move,
 )
-from skills.planning.passes import PassPath, Ticks, Way, other_arm, solve, ways
+from skills.planning.passes import PassPath, Route, Ticks, lay_out, other_arm, solve
 
 __all__ = ["A1", "A2", "MAX_SPEED_MM_S", "TRANSFER", "PassPath", "Trajectory", "joint_ratios", "time_parametrise"]
 
@@ -256,7 +256,7 @@ def time_parametrise(
     _check_rate(rate_hz)
     if not (isfinite(pause_s) and 0 <= pause_s <= 3600):
         raise BadSpeed("The pause between passes must be 0 to 3600 s.", pause_s=pause_s)
-    routes = ways(passes, psm_m)
+    routes = lay_out(passes, psm_m)
     peak_mm_s = _peak_mm_s(routes)
     tempo = 1.0 if peak_mm_s <= speed_mm_s else speed_mm_s / peak_mm_s
     paces = (Pace(speed_mm_s, PEAK_TURN_RAD_S, rate_hz, tempo),) * 3
@@ -293,7 +293,7 @@ def time_parametrise(
     )
 
 
-def _peak_mm_s(routes: Sequence[Way]) -> float:
+def _peak_mm_s(routes: Sequence[Route]) -> float:
     """Return the greatest speed of the recorded hands, 0 if there are none.
 
     Raises:
@@ -359,7 +359,7 @@ class _Sampled:
     other_jaw_rad: Floats | None = None
 
 
-def _sample(one: Way, paces: Paces) -> _Sampled:
+def _sample(one: Route, paces: Paces) -> _Sampled:
     """Sample one pass; the end of a phase and the beginning of the next are one tick, at rest."""
     hands = len(one.transfer[-1]) == 2 and one.handed is not None
     legs = [move(start, end, paces[TRANSFER]) for start, end in pairwise(one.transfer)]
@@ -430,7 +430,7 @@ def poses_along(one: PassPath, psm_m: PsmM | None, step_mm: float) -> PassPoses:
         NoMotion: Nothing moves.
         BadPlan: It has no A2, but PSM_M would take the needle there.
     """
-    (way,) = ways([one], psm_m)
+    (way,) = lay_out([one], psm_m)
     fine = _sample(way, (Pace(20.0, PEAK_TURN_RAD_S, RATE_HZ[1] / 10),) * 3)
     phase = np.repeat(np.array([TRANSFER, A1, A2], np.int8), fine.counts)
     gone = np.zeros(len(phase) - 1)
@@ -445,7 +445,7 @@ def poses_along(one: PassPath, psm_m: PsmM | None, step_mm: float) -> PassPoses:
     return PassPoses(tuple(Poses(arm.tip_mm[at], arm.rotation[at]) for arm in fine.poses), phase[at], jaw)
 
 
-def _brought(one: Way, pace: Pace) -> tuple[Poses, float, Floats | None]:
+def _brought(one: Route, pace: Pace) -> tuple[Poses, float, Floats | None]:
     """Return the poses of A1, its greatest distance from its straight moves, and the recorded angles of the jaw."""
     first = one.transfer[-1][0].rotation
     if one.hand is None:

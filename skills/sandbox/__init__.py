@@ -46,7 +46,7 @@ _CODES = {errno.EFBIG: _TOO_MUCH, errno.ENOSPC: _DISK_FULL, errno.EDQUOT: _DISK_
 _CODES |= {errno.EPERM: _CONTAINED, errno.EACCES: _CONTAINED}
 _NOTED_BYTES = 2000
 # numba needs its cache folder; without it every process would compile the loops again.
-_KEPT = ("PATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME")
+_PASSED_ON = ("PATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME")
 # glibc's; larger blocks than the second threshold are still returned at once, and it allows no higher one. Arrow's own
 # allocator reserves 1 GiB of addresses at a time, which leaves others nothing below a limit.
 _MALLOC = {
@@ -101,7 +101,7 @@ def environment() -> dict[str, str]:
     One heap for all threads: glibc reserves 64 MiB for each further one, which a fork could use above its limit. The
     heap keeps freed memory: these processes end soon, and a page that is returned is mapped again by the next array.
     """
-    kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
+    kept = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return kept | threads | _MALLOC | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
 

@@ -135,7 +135,7 @@ def _serve(
             continue
         try:
             request, files, _, _ = socket.recv_fds(control, MAX_REQUEST_BYTES, 4)
-        except ConnectionResetError:  # the asker ended before it read what it was told
+        except ConnectionResetError:  # the caller ended before it read what it was told
             return
         if not request:
             return
@@ -148,19 +148,19 @@ def _serve(
 
 
 def _fork(
-    request: dict[str, Any], inherited: _Inherited, given: int, answer: int, said: int, asker: int
+    request: dict[str, Any], inherited: _Inherited, given: int, answer: int, said: int, caller: int
 ) -> _Child | None:
     """Fork a process for a request; return None where the system refuses another process."""
-    server, line = os.getpid(), socket.socket(fileno=asker)
+    server, line = os.getpid(), socket.socket(fileno=caller)
     try:
         pid = os.fork()
     except OSError:
         pid = -1
     if pid == 0:
-        _be_child(request, given, answer, said, server, inherited)
+        _run_child(request, given, answer, said, server, inherited)
     for file in (given, answer, said):
         os.close(file)
-    _tell(line, BEGUN if pid > 0 else NO_FORK)
+    _send(line, BEGUN if pid > 0 else NO_FORK)
     if pid < 0:
         line.close()
         return None
@@ -180,7 +180,7 @@ def _ended(child: _Child, events: selectors.BaseSelector, children: dict[int, _C
     _kill(child)  # its descendants, before waitpid lets the system reuse its process id
     code = os.waitstatus_to_exitcode(os.waitpid(child.pid, 0)[1])
     shutil.rmtree(child.folder, ignore_errors=True)
-    _tell(child.line, str(code).encode())
+    _send(child.line, str(code).encode())
     events.unregister(child.ended)
     if child.line in events.get_map():
         events.unregister(child.line)
@@ -196,12 +196,12 @@ def _kill(child: _Child) -> None:
             kill(child.pid, signal.SIGKILL)
 
 
-def _tell(line: socket.socket, message: bytes) -> None:
+def _send(line: socket.socket, message: bytes) -> None:
     with suppress(OSError):  # the caller may have disconnected
         line.send(message)
 
 
-def _be_child(
+def _run_child(
     request: dict[str, Any], given: int, answer: int, said: int, server: int, inherited: _Inherited
 ) -> NoReturn:
     """Close all files but those of this request, apply the limits and the containment, call the function, exit."""

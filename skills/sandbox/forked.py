@@ -360,18 +360,18 @@ def _ask(
                 socket.send_fds(server.control, [request], [*files, theirs.fileno()])
         except OSError as error:
             raise _Dead from error
-        if (begun := _told(ours, START_S)) != BEGUN:
+        if (begun := _receive(ours, START_S)) != BEGUN:
             raise _Dead if begun is None else Busy(_NO_PROCESS)
         until = time.monotonic() + wall_s
         while (left_s := until - time.monotonic()) > 0:
-            if (ended := _told(ours, left_s if watch is None else min(left_s, WATCHED_S))) is not None:
+            if (ended := _receive(ours, left_s if watch is None else min(left_s, WATCHED_S))) is not None:
                 return int(ended)
             if watch is not None:
                 watch(_lately(files[2]))
     return None
 
 
-def _told(line: socket.socket, within_s: float) -> bytes | None:
+def _receive(line: socket.socket, within_s: float) -> bytes | None:
     """Return the next message of the server; None if none comes in time.
 
     Raises:

@@ -2,8 +2,7 @@
 
 Answers and requests of a noun are in one module: `people`, `recordings`, `demos`, `datasets`, `comparison`, `scores`.
 The base class of requests and the types of their fields are in `requests`; requests are strict, unknown fields are
-refused.
-A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
+refused. A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
 
 Lengths are mm; the frame of a position is in a field of its own.
 """

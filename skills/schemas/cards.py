@@ -13,6 +13,7 @@ from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
 from skills.gridworld.reward import RewardLevels
 from skills.schemas import DemoOutcome, Given, Grid, PolicyName
 from skills.schemas.demos import DemoReport
+from skills.schemas.people import Consent, SutureType
 from skills.schemas.policies import Combined, Coverage, GridCertificate, TrainingFigures
 
 
@@ -63,18 +64,8 @@ class CardSurgeon(Given):
     skill_level: str | None
     handedness: str | None
     protocol: str | None
-    consent: dict[str, Any] | None
+    consent: Consent | None
     consent_in_words: str
-
-
-class CardSutureType(Given):
-    """The suture type of the style."""
-
-    suture: Slug
-    name: str
-    also_called: list[str]
-    family: str
-    description: str
 
 
 class CardRecording(Given):
@@ -278,7 +269,7 @@ class PolicyCard(Given):
     policy: CardPolicy
     status: CardStatus
     surgeon: CardSurgeon
-    suture_type: CardSutureType
+    suture_type: SutureType
     demonstrations: list[CardDemonstration] = Field(description="The oldest first.")
     combined: CardCombined | None = Field(
         description="How several demonstrations were combined into one path; null for one."

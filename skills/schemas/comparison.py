@@ -65,7 +65,7 @@ EXAMPLE: dict[str, Any] = {
             "share": 0.5,
             "offset": -8.9,
             "size": 9.0,
-            "said": "In the middle third, the path of heron is 8.9 mm lower than that of kestrel; ...",
+            "sentence": "In the middle third, the path of heron is 8.9 mm lower than that of kestrel; ...",
             "shares": [[0.05, 0.05, 0.1], [0.05, 0.05, 0.5], [0.05, 0.05, 0.1]],
             "offsets": [[0.1, 0.1, -1.6], [0.2, 0.3, -8.9], [0.1, 0.1, -1.7]],
         }
@@ -83,14 +83,14 @@ EXAMPLE: dict[str, Any] = {
             "log_loss": 0.02,
             "log_loss_of_guessing": 0.693,
             "sureness": 0.98,
-            "curve": [{"demos": 2, "said": 0.97, "right": 1.0}, {"demos": 2, "said": 0.99, "right": 1.0}],
+            "curve": [{"demos": 2, "predicted": 0.97, "right": 1.0}, {"demos": 2, "predicted": 0.99, "right": 1.0}],
             "stranger_if_known": 0.3,
             "stranger_if_left_out": 0.4,
         }
     ],
     "no_recognition_because": None,
     "votes": {"recordings": 4, "right": 4, "accuracy": 1.0, "interval": [0.51, 1.0], "chance": 0.5},
-    "whose": {
+    "recognised": {
         "demo": IDS[3],
         "arm": "PSM2",
         "surgeon": "kestrel",
@@ -136,7 +136,7 @@ class Merge(Given):
     demos: Count
 
 
-class OfSurgeon(Given):
+class SurgeonCount(Given):
     """The number of a surgeon's demonstrations in a cluster."""
 
     surgeon: Slug
@@ -150,7 +150,7 @@ class Cluster(Given):
     demos: Count
     medoid: Sha256 = Field(description="The demonstration that is nearest to all others in the cluster.")
     spread: float | None = Field(description="Mean distance of the others to the medoid; null for a single one.")
-    surgeons: list[OfSurgeon] = Field(description="In decreasing order of `demos`.")
+    surgeons: list[SurgeonCount] = Field(description="In decreasing order of `demos`.")
 
 
 class Consistency(Given):
@@ -169,7 +169,7 @@ class Consistency(Given):
     )
 
 
-class Apartness(Given):
+class SurgeonDifference(Given):
     """The difference between the medoids of two surgeons, by thirds of the path and axes of a shape's own frame."""
 
     one: Slug
@@ -182,17 +182,17 @@ class Apartness(Given):
     share: Fraction = Field(description="Of the distance, in this part along this axis.")
     offset: float = Field(description="Mean signed offset of `one` there, in `unit`: along, to the left or upwards.")
     size: float = Field(description="The same without signs: over twice the offset if the two paths cross.")
-    said: str
+    sentence: str
     shares: Thirds
     offsets: Thirds
 
 
-class Calibrated(Given):
+class CalibrationBin(Given):
     """One group of a calibration curve: tested demonstrations with similar probability of the guessed surgeon."""
 
     demos: Count
-    said: Fraction = Field(description="Mean probability of the guess.")
-    right: Fraction = Field(description="Share of right guesses: equal to `said` if the probabilities hold.")
+    predicted: Fraction = Field(description="Mean probability of the guess.")
+    right: Fraction = Field(description="Share of right guesses: equal to `predicted` if the probabilities hold.")
 
 
 class Recognition(Given):
@@ -216,7 +216,7 @@ class Recognition(Given):
     sureness: Fraction = Field(
         description="Mean probability of the guesses: equal to the accuracy if the probabilities are right."
     )
-    curve: list[Calibrated] = Field(description="In increasing order of `said`.")
+    curve: list[CalibrationBin] = Field(description="In increasing order of `predicted`.")
     stranger_if_known: Fraction = Field(description="Mean probability of `none_of_these` where the surgeon is known.")
     stranger_if_left_out: Fraction = Field(description="The same with the surgeon's demonstrations left out.")
 
@@ -238,7 +238,7 @@ class Likely(Given):
     probability: Fraction
 
 
-class Whose(Given):
+class RecognisedDemo(Given):
     """The recognised surgeons of one demonstration."""
 
     demo: Sha256
@@ -295,13 +295,15 @@ class Atlas(Given):
         description="1 minus the mean error of distances on the chart, divided by the mean distance."
     )
     surgeons: list[Consistency]
-    differences: list[Apartness] = Field(description="Of all pairs of the 40 surgeons with the most demonstrations.")
+    differences: list[SurgeonDifference] = Field(
+        description="Of all pairs of the 40 surgeons with the most demonstrations."
+    )
     recognition: list[Recognition] = Field(description="By arm; an arm without recognition is not listed.")
     no_recognition_because: str | None = Field(
         default=None, description="For the arms without; null if all have recognition."
     )
     votes: Votes | None = Field(description="null without recognition.")
-    whose: Whose | None = Field(
+    recognised: RecognisedDemo | None = Field(
         description="Of the demonstration `demo` of the request; null without one, or without recognition."
     )
     notes: list[str] = Field(description="How to read the numbers, and what they do not show.")

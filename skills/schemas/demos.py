@@ -4,11 +4,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AliasChoices, AliasPath, Field, model_validator
 
 from skills.demonstration.partner import Partner
 from skills.demonstration.quality import MotionReport
-from skills.demonstration.segments import TakenSegment
 from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
 from skills.gridworld.grid import MAX_HYSTERESIS, GridMode, PathReport
 from skills.gridworld.reward import RewardLevels
@@ -47,13 +46,31 @@ class DemoReport(PathReport, MotionReport):
     partner: Partner | None
 
 
+@schema
+@dataclass(frozen=True)
+class ChosenSegment:
+    """The part of a recording that a demonstration was cut from, and the reason for this choice.
+
+    Attributes:
+        taken: Such as `proposal 1 of 1`, `the whole recording` or `the given times`.
+        start_s: Its start, in seconds since the recording's `origin_ns`.
+        end_s: Its end.
+        because: The reason in words.
+    """
+
+    taken: str
+    start_s: float
+    end_s: float
+    because: str
+
+
 class Demonstration(Given):
     """One hand-off cut out of a recording, with its measurements."""
 
-    id: Sha256
+    id: Sha256 = Field(validation_alias=AliasChoices("id", "sha256"))
     sha256: Sha256
-    recording: Sha256
-    surgeon: Slug
+    recording: Sha256 = Field(validation_alias=AliasChoices(AliasPath("recording", "sha256"), "recording"))
+    surgeon: Slug = Field(validation_alias=AliasChoices(AliasPath("surgeon", "slug"), "surgeon"))
     suture: Slug
     arm: str
     topic: str
@@ -61,7 +78,7 @@ class Demonstration(Given):
     instrument: str
     start_s: float
     end_s: float
-    segment: TakenSegment = Field(description="Which part of the recording was taken.")
+    segment: ChosenSegment = Field(description="Which part of the recording was taken.")
     session: Slug | None
     hysteresis: float = Field(description="Cells.")
     state: Literal["active", "withdrawn"]

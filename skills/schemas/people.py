@@ -3,7 +3,7 @@
 from datetime import date, datetime
 from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import AliasChoices, AwareDatetime, Field
 
 from skills.fields import Slug
 from skills.schemas import Given, Handedness, SkillLevel
@@ -21,7 +21,7 @@ class Consent(Given):
 class Surgeon(Given):
     """A surgeon, known by a pseudonym."""
 
-    surgeon: Slug
+    surgeon: Slug = Field(validation_alias=AliasChoices("surgeon", "slug"))
     skill_level: SkillLevel | None
     handedness: Handedness | None
     protocol: str | None
@@ -57,7 +57,7 @@ class SurgeonIn(Schema):
 class SutureType(Given):
     """A suture type of the catalogue."""
 
-    suture: Slug
+    suture: Slug = Field(validation_alias=AliasChoices("suture", "slug"))
     name: str
     also_called: list[str]
     family: str

@@ -25,7 +25,16 @@ from skills.planning.plan import (
 )
 from skills.planning.trajectory import MAX_SPEED_MM_S, Seam, Transfer
 from skills.schemas import Given, PolicyName
-from skills.schemas.requests import Component, Coordinate, Name, Number, PointIn, Schema, SlugField, shown
+from skills.schemas.requests import (
+    Component,
+    Coordinate,
+    Name,
+    Number,
+    PointIn,
+    Schema,
+    SlugField,
+    shown,
+)
 from skills.schemas.scenes import SceneIn
 
 

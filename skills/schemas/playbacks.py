@@ -10,7 +10,7 @@ from skills.fields import Count, Point, Sha256, schema
 from skills.schemas import Given, PolicyName
 from skills.schemas.requests import LINE, DigestField, Schema, Size, Source, shown
 from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
-from skills.verification.probabilities import Doubt, Probability
+from skills.verification.probabilities import Probability, SuccessEstimate
 from skills.verification.scene_clearance import SceneReport
 from skills.verification.verdict import PlaybackReport
 
@@ -76,7 +76,7 @@ class Verdict(PlaybackReport):
     """
 
     failure_in_words: str | None
-    doubt: Doubt
+    doubt: SuccessEstimate
     plan: Sha256
     trajectory: Sha256
     policy: PolicyName

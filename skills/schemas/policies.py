@@ -14,7 +14,7 @@ from skills.learning.certificate import NearOdds, NearStarts
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.in_scene import SceneCertificate
 from skills.learning.q_learning import Training
-from skills.learning.ties import ShortestWay
+from skills.learning.ties import ShortestApproach
 from skills.planning.plan import DrivenPass
 from skills.schemas import DemoOutcome, Given, Grid, PolicyName
 from skills.schemas.requests import PointIn, Schema, shown
@@ -231,7 +231,7 @@ class Policy(PolicyName):
     )
     format: Literal[1, 2] = Field(default=1, description="Left out: 1. 2: with `joining`, see above.")
     joining: Joining | None = Field(default=None, description="Of format 2.")
-    ties: ShortestWay | None = Field(
+    ties: ShortestApproach | None = Field(
         default=None,
         description="The rule among equally good actions; null or absent: the lowest index. The actions follow it: "
         "take them, and not the first largest of the Q values in the arrays.",

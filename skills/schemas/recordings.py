@@ -29,8 +29,8 @@ class Motion:
 
 @schema
 @dataclass(frozen=True)
-class Quality:
-    """The recording quality of a motion.
+class PreviewedQuality:
+    """The recording quality of a motion; durations and rate are null where the samples have no times.
 
     Attributes:
         equal_samples: Samples that repeat the pose of the sample before to the last bit, as they do where a recorder is
@@ -39,11 +39,20 @@ class Quality:
 
     arm: str
     topic: str
-    duration_s: float
+    duration_s: float | None
     rate_hz: float | None
-    longest_gap_s: float
+    longest_gap_s: float | None
     extent_mm: Point
     equal_samples: Count
+
+
+@schema
+@dataclass(frozen=True)
+class Quality(PreviewedQuality):
+    """The recording quality of a motion, whose samples have times."""
+
+    duration_s: float
+    longest_gap_s: float
 
 
 @schema
@@ -176,7 +185,7 @@ class RecordingContent(ContentLists):
     quality: list[Quality]
 
 
-class Described(ContentLists):
+class Described(Given):
     """The content of a raw file with its identity, and the proposed hand-offs."""
 
     sha256: Sha256
@@ -186,12 +195,10 @@ class Described(ContentLists):
     integrity: Literal["full", "partial", "none"] = Field(description="How much of it a checksum vouches for.")
 
 
-class Recording(Described):
+class Recording(Described, RecordingContent):
     """A raw file as it was uploaded: its content, its quality, and the proposed hand-offs."""
 
     id: Sha256
-    duration_s: float
-    quality: list[Quality]
     created_at: datetime
 
 
@@ -209,25 +216,7 @@ class RecordingSummary(Given):
     created_at: datetime
 
 
-@schema
-@dataclass(frozen=True)
-class PreviewedQuality:
-    """The quality of a motion; durations and rate are null where the samples have no times.
-
-    Attributes:
-        equal_samples: Samples that repeat the pose of the sample before to the last bit.
-    """
-
-    arm: str
-    topic: str
-    duration_s: float | None
-    rate_hz: float | None
-    longest_gap_s: float | None
-    extent_mm: Point
-    equal_samples: Count
-
-
-class RecordingPreview(Described):
+class RecordingPreview(Described, ContentLists):
     """The content of a raw file as it would be read; nothing of it is stored."""
 
     timed: bool = Field(description="Whether the samples have times; a table without them is stored only with a rate.")
@@ -267,11 +256,8 @@ class SuturePoints(Given):
     points: tuple[SuturePoint, ...]
 
 
-READING = {"column", "unit", "decimal", "table_arm", "instrument"}
-
-
-class Reading(Schema):
-    """Statements about a recording that the recording itself does not make."""
+class TableIn(Schema):
+    """Statements about a recording that it does not make itself, most of them about a table (docs/tables.md)."""
 
     rate_hz: Annotated[float, Field(gt=0, le=10_000)] | None = Field(
         default=None, description="Samples per second, of a table without times."
@@ -281,17 +267,6 @@ class Reading(Schema):
         description="The frame of the poses in a table or a LeRobot dataset; base, the default for a table of one arm: "
         "the arm's base.",
     )
-
-    @property
-    def said(self) -> dict[str, Any]:
-        """The reader's arguments: rate and frame, and of the others those that were given, as they are stored."""
-        given = self.model_dump(include=READING, exclude_none=True)
-        return {"rate_hz": self.rate_hz, "frame": self.frame, **given}
-
-
-class TableIn(Reading):
-    """Statements about a table (docs/tables.md)."""
-
     column: Annotated[list[Annotated[str, Field(max_length=200, pattern=LINE)]], Field(max_length=30)] | None = Field(
         default=None,
         description="A column under another name, of a table as x_mm=NAME, or as x=NAME with a unit (docs/tables.md).",
@@ -306,6 +281,11 @@ class TableIn(Reading):
     instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = Field(
         default=None, description="The instrument with which a table's joints become poses."
     )
+
+    @property
+    def options(self) -> dict[str, Any]:  # keyword arguments
+        """The arguments of `read_recording` that are stated."""
+        return self.model_dump(include={*TableIn.model_fields}, exclude_none=True)
 
 
 class StatedIn(TableIn):

@@ -33,8 +33,7 @@ from skills.demonstration.movement import same_signs, smoothed_tip, spans_of
 from skills.fields import Point, schema
 from skills.kinematics import quaternion_of
 from skills.learning.evaluation import dtw
-from skills.learning.pose_style import mean_rotation
-from skills.quaternions import INVERSE, angle_of, multiplied, unit
+from skills.quaternions import INVERSE, angle_of, mean_rotation, multiplied, unit
 
 NEAR_MM = 1.0  # mean distance; a fifth of the paper's cell, and the drift of a held hand in a second
 NAMED_SHARE = 0.2  # of the total, in one third along one axis; each has a ninth if none stands out

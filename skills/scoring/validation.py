@@ -120,7 +120,7 @@ def parse_task(stored: Mapping[str, Any]) -> TaskValidation:
     """Return the validation of a task from the JSON that is stored with a model.
 
     Args:
-        stored: The validation as plain JSON, as `dataclasses.asdict` writes it.
+        stored: The validation as plain JSON, field by field.
     """
     return parse_json(TaskValidation, stored)
 

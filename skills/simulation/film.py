@@ -38,8 +38,8 @@ FRAMES = 60  # over a plan of a few passes
 FRAMES_PER_PASS, MOST_FRAMES = 12, 300
 FRAMES_PER_S = 10
 HELD_FRAMES = 10  # repetitions of the last frame
-SHOOTING_S = 600.0  # generous, because nobody waits for a film and jobs that people wait for have priority
-CREW = "skills.simulation.film:film"
+FILM_TIMEOUT_S = 600.0  # generous, because nobody waits for a film and jobs that people wait for have priority
+FILM_MAKER = "skills.simulation.film:film"
 
 # Pixels; H.264 wants whole blocks of 16.
 WIDTH, HEIGHT = 480, 368
@@ -99,14 +99,14 @@ CLASSES = packing.known(FilmRequest, Trajectory, OtherArm, Poses, Film)
 # ---- outside the process ---------------------------------------------------------------------------------------
 
 
-def shoot(
+def make_film(
     trajectory: Trajectory,
     *,
     pad_top_mm: float,
     samples: ArrayLike | None = None,
-    timeout_s: float = SHOOTING_S,
+    timeout_s: float = FILM_TIMEOUT_S,
     memory_bytes: int = 1 << 30,
-    target: str = CREW,
+    target: str = FILM_MAKER,
 ) -> Film:
     """Film a trajectory in a separate process.
 
@@ -121,7 +121,7 @@ def shoot(
     Raises:
         SimulationFailed: PyBullet is missing, or it crashed, hung, ran out of memory or returned no film.
     """
-    if target == CREW:
+    if target == FILM_MAKER:
         simulator.require_pybullet()
     at = frames_of(trajectory) if samples is None else np.asarray(samples, np.int64)
     limits = ProcessLimits(memory_bytes, timeout_s, program=_encoder())
@@ -147,7 +147,7 @@ def frames_of(trajectory: Trajectory) -> Ints:
 
 
 def film(given: BinaryIO, answer: BinaryIO) -> None:
-    """Make the film that `shoot` requests."""
+    """Make the film that `make_film` requests."""
     os.nice(_NICENESS)
     asked = packing.read(given, CLASSES)
     assert isinstance(asked, FilmRequest)

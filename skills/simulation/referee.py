@@ -62,7 +62,7 @@ from skills.verification.clearance import (
 )
 from skills.verification.error_draws import Displaced, Drawn, draw
 from skills.verification.monte_carlo import at_hand_off, caught_by, scene_of
-from skills.verification.probabilities import DoubtSettings, Probability, share
+from skills.verification.probabilities import EstimateSettings, Probability, share
 
 TRIALS = "skills.simulation.referee:trials"
 LOST = ("before", "missed", "dropped")
@@ -246,7 +246,7 @@ def referee(
     varied: int = 0,
     seed: int = 0,
     physics: Physics | None = None,
-    settings: DoubtSettings | None = None,
+    settings: EstimateSettings | None = None,
     memory_bytes: int = 1 << 30,
     target: str = TRIALS,
 ) -> Refereed:
@@ -275,7 +275,7 @@ def referee(
         raise BadSettings("A referee needs 1 to 100000 trials, no more varied ones than these, and a seed from 0 on.")
     if target == TRIALS:
         require_mujoco()
-    plain, conditions = physics or Physics(), settings or DoubtSettings()
+    plain, conditions = physics or Physics(), settings or EstimateSettings()
     watched = _watched(trajectory, number)
     sizes = {"suture_point_mm": conditions.suture_point_mm, "needle_rad": conditions.needle_rad}
     drawn = draw(seed, number, trials, len(watched), **sizes)
@@ -337,7 +337,7 @@ def _watched(trajectory: Trajectory, number: int) -> Ints:
 
 
 def _closed_form(
-    trajectory: Trajectory, number: int, drawn: Drawn, displaced: Displaced, conditions: DoubtSettings
+    trajectory: Trajectory, number: int, drawn: Drawn, displaced: Displaced, conditions: EstimateSettings
 ) -> Flags:
     """Return whether the closed form calls the needle caught, shape (N,)."""
     scene = scene_of(trajectory, number, -np.inf, conditions.opening_rad)

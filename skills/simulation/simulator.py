@@ -402,7 +402,7 @@ def kinematic_pass(scene: Simulator, asked: PlayRequest) -> KinematicPass:
     Distances are measured at the requested samples, and then at all others where links may be near each other.
     """
     motion = asked.trajectory
-    look = _Look(scene, motion)
+    distances = _Distances(scene, motion)
     values, places, turns = array("d"), array("d"), array("d")
     due = set(asked.looks.tolist())
     bullet, client, arm = scene.bullet, scene.client, scene.arm
@@ -416,21 +416,21 @@ def kinematic_pass(scene: Simulator, asked: PlayRequest) -> KinematicPass:
         places.extend(frame[PLACE])
         turns.extend(frame[TURN])
         if k in due:
-            look.at(k)
-    for k in _closer(look.seen_mm(), asked).tolist():
+            distances.at(k)
+    for k in _closer(distances.seen_mm(), asked).tolist():
         scene.pose(motion.joints[k])
-        look.at(k)
+        distances.at(k)
     read = _table(values, 6)
     read[:, INSERTION] /= MM
-    looked_at, order = look.samples()
+    looked_at, order = distances.samples()
     return KinematicPass(
         tip_mm=_table(places, 3) / MM,
         rotation_xyzw=_table(turns, 4),
         joints=read,
         looked_at=looked_at,
-        clearances_mm=look.seen_mm()[order],
-        shaft_off_mm=look.shaft_off_mm()[order],
-        psm_m_tip_mm=None if scene.psm_m is None else look.psm_m_tip_mm()[order],
+        clearances_mm=distances.seen_mm()[order],
+        shaft_off_mm=distances.shaft_off_mm()[order],
+        psm_m_tip_mm=None if scene.psm_m is None else distances.psm_m_tip_mm()[order],
     )
 
 
@@ -457,7 +457,7 @@ def _closer(seen_mm: Floats, asked: PlayRequest) -> Ints:
     return np.setdiff1d(np.flatnonzero(near), asked.looks)
 
 
-class _Look:
+class _Distances:
     """The measurements at some samples, with PSM_A already posed there; PSM_M, if it is in the scene, is posed here."""
 
     def __init__(self, scene: Simulator, motion: Trajectory) -> None:

@@ -125,8 +125,7 @@ class ArmCalibration:
     correlation_s: float | None
     errors: ArmErrors
 
-    @property
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return what was measured, and what was not, in sentences."""
         said = (
             f"{self.samples} samples count as {self.effective:.0f} independent ones, because errors last. "

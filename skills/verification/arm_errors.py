@@ -72,8 +72,7 @@ class ArmErrors:
         changed: dict[str, Any] = {size: 0.0}
         return replace(self, **changed)
 
-    @property
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return the sizes as a phrase."""
         return (
             f"registration {self.registration_mm:g} mm and {self.registration_deg:g} degrees, wrist {self.wrist_deg:g} "

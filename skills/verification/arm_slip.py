@@ -50,8 +50,7 @@ class MeasuredSlip:
     interval: tuple[Fraction, Fraction]
     tip_elsewhere: Fraction | None
 
-    @property
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return the slip, what to state, and what was not seen, in sentences."""
         low, high = self.interval
         tip = (

@@ -289,19 +289,19 @@ def _gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits:
 
 
 def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
-    whose = "" if arm.name == PSM_A else f"{arm.name}'s "
+    prefix = "" if arm.name == PSM_A else f"{arm.name}'s "
     spare = limits.joint_margin * (arm.tool.upper - arm.tool.lower) - ROUND_OFF
     upper, lower = arm.tool.upper - spare, arm.tool.lower + spare
     for joint, name in enumerate(JOINTS):
         values = arm.joints[:, joint]
-        yield _Gate(f"{whose}{name}", UNITS[joint], values, float(upper[joint]))
-        yield _Gate(f"{whose}{name}", UNITS[joint], values, float(lower[joint]), at_least=True)
+        yield _Gate(f"{prefix}{name}", UNITS[joint], values, float(upper[joint]))
+        yield _Gate(f"{prefix}{name}", UNITS[joint], values, float(lower[joint]), at_least=True)
     least_mm = limits.insertion_mm + arm.tool.cannula_mm - CANNULA_MM
-    yield _Gate(f"{whose}insertion out of the cannula", "mm", arm.joints[:, INSERTION], least_mm, True)
+    yield _Gate(f"{prefix}insertion out of the cannula", "mm", arm.joints[:, INSERTION], least_mm, True)
     for joint, name in enumerate(JOINTS):
-        yield _Gate(f"speed of {whose}{name}", "of its limit", arm.speed[:, joint], limits.speed_ratio)
+        yield _Gate(f"speed of {prefix}{name}", "of its limit", arm.speed[:, joint], limits.speed_ratio)
         accelerations = arm.acceleration[:, joint]
-        yield _Gate(f"acceleration of {whose}{name}", "of its limit", accelerations, limits.acceleration_ratio)
+        yield _Gate(f"acceleration of {prefix}{name}", "of its limit", accelerations, limits.acceleration_ratio)
 
 
 def _clearance_gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:

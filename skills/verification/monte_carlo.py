@@ -1,6 +1,6 @@
 """Monte Carlo: the probability that a plan succeeds in the presence of errors, from seeded variations in closed form.
 
-    Trajectory --doubt--> Doubt: how often each pass stays clear and its needle is caught
+    Trajectory --estimate_success--> SuccessEstimate: how often each pass stays clear and its needle is caught
 
 A *variation* of a pass draws the errors of `skills.verification.arm_errors`, independently of one another:
 
@@ -79,8 +79,8 @@ from skills.verification.probabilities import (
     NEEDLE,
     UPWARDS,
     Cost,
-    Doubt,
-    DoubtSettings,
+    EstimateSettings,
+    SuccessEstimate,
     counted,
     share,
 )
@@ -353,7 +353,7 @@ def _least(values: Floats, count: int) -> Floats:
     return np.asarray(values.reshape(count, -1).min(axis=1))
 
 
-def doubt(
+def estimate_success(
     trajectory: Trajectory,
     *,
     approach_m: ArrayLike | None,
@@ -361,9 +361,9 @@ def doubt(
     pad_normal: Point = UPWARDS,
     errors: ArmErrors = UNCALIBRATED,
     seed: int = 0,
-    settings: DoubtSettings | None = None,
+    settings: EstimateSettings | None = None,
     limits: Limits | None = None,
-) -> Doubt:
+) -> SuccessEstimate:
     """Vary a plan and count how often its passes stay clear and its needles are caught.
 
     Args:
@@ -392,7 +392,7 @@ def doubt(
         raise BadInput("The pad's normal must be a direction of length 1.", pad_normal=list(pad_normal))
     if seed < 0:
         raise BadSettings("A seed must be 0 or more.", seed=seed)
-    varied, allowed = settings or DoubtSettings(), limits or Limits()
+    varied, allowed = settings or EstimateSettings(), limits or Limits()
     top_mm = -inf if pad_top_mm is None else float(pad_top_mm)
     scenes = [scene_of(trajectory, k, top_mm, varied.opening_rad, pad_normal) for k in range(trajectory.passes)]
     thin = [looked_at(scene, varied.stretches) for scene in scenes]
@@ -404,7 +404,7 @@ def doubt(
     ]
     whole = np.logical_and.reduce([one.succeeds for one in found])
     costs = [Cost(size, share(~good)) for size, good in zip([*spared, NEEDLE], whole, strict=False)]
-    return Doubt(
+    return SuccessEstimate(
         seed=seed,
         pad_top_mm=None if pad_top_mm is None else top_mm,
         with_psm_m=trajectory.psm_m is not None,
@@ -422,7 +422,7 @@ def doubt(
     )
 
 
-def _draws(scenes: Sequence[PlannedPass], seed: int, varied: DoubtSettings) -> list[Drawn]:
+def _draws(scenes: Sequence[PlannedPass], seed: int, varied: EstimateSettings) -> list[Drawn]:
     sizes = {"suture_point_mm": varied.suture_point_mm, "needle_rad": varied.needle_rad}
     return [draw(seed, k, varied.variations, len(scene.phase), **sizes) for k, scene in enumerate(scenes)]
 
@@ -448,7 +448,7 @@ def _judged(
     approach_m: ArrayLike | None,
     under: Sequence[ArmErrors],
     spared: Sequence[ArmErrors],
-    varied: DoubtSettings,
+    varied: EstimateSettings,
     limits: Limits,
 ) -> _Judged:
     """Judge a pass under some errors, and whether it succeeds under the `spared` ones."""
@@ -510,7 +510,7 @@ def at_hand_off(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: floa
 
 
 def caught_by(
-    arms: tuple[Planned, Planned], shift_mm: Floats, errors: Displaced, turned: Floats, varied: DoubtSettings
+    arms: tuple[Planned, Planned], shift_mm: Floats, errors: Displaced, turned: Floats, varied: EstimateSettings
 ) -> tuple[Flags, Flags]:
     """Return whether the needle is between PSM_M's fingers, and at a right angle, each of shape (N,).
 

@@ -1,12 +1,10 @@
 """The report of a Monte Carlo estimate: its settings, counts, probabilities, and the cost of each error.
 
-    faults of N variations --counted--> DoubtUnder: every pass, and the whole plan
-    DoubtUnder, Cost --Doubt--> the report as plain numbers, which is a part of a stored verdict
-
-Verdicts are stored for good, so fields that the first judge did not write have a default.
+faults of N variations --counted--> EstimateUnder: every pass, and the whole plan
+EstimateUnder, Cost --SuccessEstimate--> the report as plain numbers, which is a part of a stored verdict
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import isfinite, radians
 
 import numpy as np
@@ -19,9 +17,7 @@ from skills.planning.handoff import OPEN_RAD
 from skills.verification.arm_errors import ArmErrors
 from skills.verification.gates import Limits
 
-# 1: tip errors alone, stated as a mean length. 2: PSM_M's jaw open throughout, fingers touch in the last sample alone,
-# sloping tissue level.
-JUDGE_VERSION = 1
+JUDGE_VERSION = 1  # raise it when the same plan would be judged otherwise
 UPWARDS = (0.0, 0.0, 1.0)
 ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms", "bodies"), ("place", "angle")
 NEEDLE = "needle"  # of a `Cost`: the needle's angle in the jaws, which is no error of the arms
@@ -29,7 +25,7 @@ NEEDLE = "needle"  # of a `Cost`: the needle's angle in the jaws, which is no er
 
 @schema
 @dataclass(frozen=True)
-class DoubtSettings:
+class EstimateSettings:
     """The errors beside those of the arms, and the conditions of a catch. All are ours; each has its reason.
 
     Attributes:
@@ -100,7 +96,7 @@ class Faults:
 
 @schema
 @dataclass(frozen=True)
-class PassDoubt:
+class PassEstimate:
     """A pass under some errors: it succeeds if it is clear and, if there is a hand-off, the needle is caught."""
 
     succeeds: Probability
@@ -111,20 +107,18 @@ class PassDoubt:
 
 @schema
 @dataclass(frozen=True)
-class DoubtUnder:
+class EstimateUnder:
     """A plan under some errors of the arms: every pass, and all of them one after another.
 
     Attributes:
         plan: The whole plan.
         passes: Each pass.
         errors: The errors.
-        tip_error_mm: Not used any more; null.
     """
 
     plan: Probability
-    passes: tuple[PassDoubt, ...]
+    passes: tuple[PassEstimate, ...]
     errors: ArmErrors
-    tip_error_mm: float | None = None
 
 
 @schema
@@ -143,7 +137,7 @@ class Cost:
 
 @schema
 @dataclass(frozen=True)
-class Doubt:
+class SuccessEstimate:
     """The result as plain numbers: the same for the same trajectory, pad, errors, settings and seed on every machine.
 
     Attributes:
@@ -165,15 +159,15 @@ class Doubt:
     with_psm_m: bool
     hand_offs: Count
     looked_at: tuple[int, ...]
-    under: tuple[DoubtUnder, ...]
-    settings: DoubtSettings = field(default_factory=DoubtSettings)
-    limits: Limits = field(default_factory=Limits)
-    costs: tuple[Cost, ...] = ()
-    version: Count = 1
-    pad_normal: Point = UPWARDS
+    under: tuple[EstimateUnder, ...]
+    settings: EstimateSettings
+    limits: Limits
+    costs: tuple[Cost, ...]
+    version: Count
+    pad_normal: Point
 
 
-def counted(found: list[dict[str, Flags]], errors: ArmErrors) -> DoubtUnder:
+def counted(found: list[dict[str, Flags]], errors: ArmErrors) -> EstimateUnder:
     """Count the variations of each pass; variation k of a plan succeeds if variation k of all its passes does.
 
     Args:
@@ -181,12 +175,12 @@ def counted(found: list[dict[str, Flags]], errors: ArmErrors) -> DoubtUnder:
         errors: The errors of the arms.
     """
     wrong = np.any([np.any(list(one.values()), axis=0) for one in found], axis=0)
-    return DoubtUnder(share(wrong), tuple(_pass(one) for one in found), errors)
+    return EstimateUnder(share(wrong), tuple(_pass(one) for one in found), errors)
 
 
-def _pass(found: dict[str, Flags]) -> PassDoubt:
+def _pass(found: dict[str, Flags]) -> PassEstimate:
     on_the_way, at_the_end = ([found[name] for name in names if name in found] for names in (ON_THE_WAY, AT_THE_END))
-    return PassDoubt(
+    return PassEstimate(
         succeeds=share(np.any(on_the_way + at_the_end, axis=0)),
         clear=share(np.any(on_the_way, axis=0)),
         caught=share(np.any(at_the_end, axis=0)) if at_the_end else None,

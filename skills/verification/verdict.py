@@ -42,9 +42,9 @@ from skills.verification.clearance import psm_m_poses
 from skills.verification.deviations import Deviations, Mismatch
 from skills.verification.gates import SCENE, ArmSamples, Failure, Figures, Limits, figures_of, first_failure
 from skills.verification.intent import compare
-from skills.verification.monte_carlo import doubt
+from skills.verification.monte_carlo import estimate_success
 from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, Playback
-from skills.verification.probabilities import UPWARDS, Doubt
+from skills.verification.probabilities import UPWARDS, SuccessEstimate
 from skills.verification.requested import requested_motion
 from skills.verification.scene_clearance import NEEDLE, SceneClearance, SceneReport, clearance_of, flat_tissue
 
@@ -297,15 +297,15 @@ class PlanVerdict:
     Attributes:
         report: The motion as it was played, compared with the limits, with the scene, and with what was asked.
         scene: Its distances from the plan's scene; None if the plan has none.
-        doubt: The probability of success when arms and world differ from the plan.
+        success: The probability of success when arms and world differ from the plan.
     """
 
     report: PlaybackReport
     scene: SceneReport | None
-    doubt: Doubt
+    success: SuccessEstimate
 
     @property
-    def failure_in_words(self) -> str | None:
+    def failure_sentence(self) -> str | None:
         """The reason why it is not feasible; one beside a scene also names the nearest parts."""
         failure = self.report.failure
         near = [] if self.scene is None else [one for one in self.scene.nearest if one.body != NEEDLE]
@@ -346,8 +346,8 @@ def judge_plan(
     report = judge(playback, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
     tissue = None if plan.scene is None else plan.scene.tissue
     top = (None, UPWARDS) if tissue is None or beside is None else flat_tissue(trajectory, beside.report, tissue)
-    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=top[0], pad_normal=top[1], errors=errors)
-    return PlanVerdict(report, None if beside is None else beside.report, doubted)
+    success = estimate_success(trajectory, approach_m=approach_m, pad_top_mm=top[0], pad_normal=top[1], errors=errors)
+    return PlanVerdict(report, None if beside is None else beside.report, success)
 
 
 def _check_same(playback: Playback, trajectory: Trajectory) -> None:

@@ -10,7 +10,7 @@ import pytest
 from skills.api.pages import drawings
 from skills.comparison.distances import STATES
 from skills.comparison.recognition import NUMBERS
-from skills.library.comparison.atlas import _compare, _told
+from skills.library.comparison.atlas import _atlas, _compare
 from skills.library.comparison.members import Member
 from skills.schemas.comparison import Atlas, LeftOutOfAtlas
 from tests import backends
@@ -45,8 +45,8 @@ def test_the_client_reads_it_and_asks_whose_style_one_is(compared: Service):
     demo = compared.client.demos()[0]["id"]
     found = compared.client.atlas(cases.SUTURE, clusters=2, demo=demo)
     assert [one["demos"] for one in found["clusters"]] == [3, 3]
-    assert found["whose"]["demo"] == demo
-    assert found["whose"]["likely"][0]["surgeon"] == found["whose"]["surgeon"] == cohorts.name(1)
+    assert found["recognised"]["demo"] == demo
+    assert found["recognised"]["likely"][0]["surgeon"] == found["recognised"]["surgeon"] == cohorts.name(1)
     assert [(one["arm"], one["right"]) for one in found["recognition"]] == [("PSM", 6)]
     assert sum(len(row) for row in found["distances"]) == 15
 
@@ -157,4 +157,4 @@ def drawn_from(far: np.ndarray) -> Atlas:
     ]
     shapes, signatures = np.zeros((len(far), STATES, 3)), np.random.default_rng(4).normal(size=(len(far), NUMBERS))
     left_out = LeftOutOfAtlas(without_consent=0, without_direction=[], overlapped=[], not_sampled=0, because=[])
-    return _told(cases.SUTURE, _compare(members, shapes, far, False, signatures, {}), left_out, 4, None)
+    return _atlas(cases.SUTURE, _compare(members, shapes, far, False, signatures, {}), left_out, 4, None)

@@ -9,7 +9,7 @@ from sqlalchemy import select
 from skills.db import now, rfc3339
 from skills.db.models import Release
 from skills.library.operation.history import sign_history
-from skills.library.people.catalogue import find_surgeon
+from skills.library.people.surgeons import find_surgeon
 from skills.library.policies.releases import withdraw
 from tests.api.service import Service, assert_problem
 from tests.independent_history import check_disclosed, root_in

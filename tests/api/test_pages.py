@@ -20,9 +20,10 @@ from skills.library.operation.integrity import covered, learnt
 from skills.library.operation.overview import MOST
 from skills.library.operation.styles import matrix
 from skills.library.operation.views import moves_to_goal
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.consent import may
+from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.versions import find_version
+from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key
 from tests.api.service import CSV, KESTREL, Service, assert_problem, serving
@@ -234,7 +235,7 @@ def test_the_view_shows_what_the_calls_give(told: Service) -> None:
 def test_the_time_line_has_every_arms_speed_and_the_presses(told: Service) -> None:
     with told.database.reading() as session:
         recording = session.scalars(select(StoredRecording).where(StoredRecording.format == "mcap")).one()
-        sha256, duration_s = recording.sha256, recording.about["duration_s"]
+        sha256, duration_s = recording.sha256, recording.about.duration_s
     traces = told.http.get(f"/pages/recordings/{sha256}/traces").json()
     (arm,) = traces["arms"]
     assert traces["duration_s"] == duration_s
@@ -312,7 +313,7 @@ def crowded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         hospital.fill(service.database, 20)
         with service.database.writing() as session:
             for number in range(200):
-                put_surgeon(session, f"wren-{number:03}", {}, "test")
+                put_surgeon(session, f"wren-{number:03}", SurgeonIn(), "test")
         yield service
 
 

@@ -234,7 +234,7 @@ def test_every_state_from_which_the_policy_finishes_is_counted(trained: Service)
 
 def test_a_policy_states_its_rule_among_equally_good_actions(trained: Service):
     policy = trained.client.policy(**KESTREL)
-    assert policy["ties"] == {"depth_from_mm": [0.0, 0.0, 0.0], "depth_along": None, "kind": "shortest-way"}
+    assert policy["ties"] == {"depth_from_mm": [0.0, 0.0, 0.0], "depth_along": None, "kind": "shortest-approach"}
     assert policy["grid_certificate"]["actions_off_rule"] == 0
     assert "depth is the distance from the remote centre" in card(trained, 1)["learner"]["in_words"]
     assert trained.client.learnt(**KESTREL).ties is not None
@@ -265,7 +265,7 @@ def test_depth_in_another_frame_is_measured_along_a_given_direction(service: Ser
     assert service.client.policy(**KESTREL, version=1)["ties"]["depth_along"] is None
     service.train(depth_along=[0.0, 0.0, 1.0])
     along = service.client.policy(**KESTREL, version=2)
-    assert along["ties"] == {"depth_from_mm": None, "depth_along": [0.0, 0.0, 1.0], "kind": "shortest-way"}
+    assert along["ties"] == {"depth_from_mm": None, "depth_along": [0.0, 0.0, 1.0], "kind": "shortest-approach"}
     assert service.client.learnt(**KESTREL, version=2).ties.depth_along == (0.0, 0.0, 1.0)
     assert "along (0, 0, 1)" in card(service, 2)["learner"]["in_words"]
 

@@ -9,8 +9,9 @@ from skills.api.policy_cache import LONGEST, Known, _asked
 from skills.api.responses import JSON
 from skills.library.operation import integrity
 from skills.library.people import consent
-from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw_all
+from skills.schemas.people import SurgeonIn
 from tests.api.service import KESTREL, POLICY, Service
 from tests.api.test_served import read_and_kept, seeing
 
@@ -59,7 +60,7 @@ def test_a_commit_that_changes_no_release_is_looked_at_once(trained: Service, mo
     monkeypatch.setattr(cache.changes, "first", counted)
     for commits in (1, 2):
         with trained.database.writing() as session:
-            put_surgeon(session, "heron", {}, "test")
+            put_surgeon(session, "heron", SurgeonIn(), "test")
         for _ in range(3):
             assert trained.http.portal.call(cache.cached, *KESTREL.values(), JSON) is body
         assert len(asked) <= commits

@@ -3,8 +3,8 @@
 import pytest
 
 from skills.client import Problem
-from skills.library.people.catalogue import put_surgeon
 from tests.api.service import KESTREL, Service, assert_problem
+from tests.library import cases
 from tests.library.styles import add_styles
 
 EXACT = {"kind": "value-iteration"}
@@ -44,7 +44,7 @@ def test_every_style_tells_what_became_of_it(trained: Service):
 def test_failures_are_named_by_their_state_and_pages_follow_one_another(trained: Service):
     add_styles(trained.database, 7)
     with trained.database.writing() as session:
-        put_surgeon(session, "surgeon-0", {"consent": {"uses": [], "until": None}}, "test")
+        cases.agree(session, {"uses": [], "until": None}, "surgeon-0")
     job = trained.client.retrain(only_stale=True)
     trained.work()
     failed = trained.client.retrained(job["id"], "failed")

@@ -15,8 +15,9 @@ from skills.errors import Conflict, NotReady
 from skills.library.operation.backup import accept_rollback, back_up, restore
 from skills.library.operation.erasure_list import erasures_of
 from skills.library.operation.history import Verified, sign_history, sign_some_history, verify_history
-from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw
+from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from skills.transparency.notes import read_notes
 from skills.transparency.signing_keys import SigningKey
@@ -72,7 +73,7 @@ def assert_closed(service: Service, why: str) -> None:
         assert "/" not in said.replace("/readyz", "")  # no path of the machine
     assert service.http.get("/healthz").status_code == 200
     with pytest.raises(NotReady, match=why), service.database.writing() as session:
-        put_surgeon(session, "wren", {}, "test")
+        put_surgeon(session, "wren", SurgeonIn(), "test")
     assert service.counts() == before
 
 

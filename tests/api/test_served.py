@@ -21,8 +21,9 @@ from skills.db.session import Database
 from skills.db.weighted_cache import WeightedCache
 from skills.errors import UnknownFormat
 from skills.library.operation import integrity
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.keys import create_key
+from skills.library.people.surgeons import put_surgeon
+from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.api.processes import learn_two_versions, server
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem, serving
@@ -381,7 +382,7 @@ def test_the_format_is_what_the_client_weighs_most(accept: str, given: str | Non
 def test_a_cached_policy_is_not_given_to_whoever_may_not_see_it(trained: Service):
     assert served(trained.http) == 1
     with trained.database.writing() as session:
-        put_surgeon(session, "heron", {}, "test")
+        put_surgeon(session, "heron", SurgeonIn(), "test")
         session.flush()
         keys = {who: create_key(session, who, "reader", "test", surgeons=[who])[1] for who in ("kestrel", "heron")}
     trained.app.state.access.forget()

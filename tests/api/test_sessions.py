@@ -30,7 +30,6 @@ from skills.api.sessions import (
     WITHDRAWN,
 )
 from skills.errors import Busy
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.keys import create_key, revoke_key
 from skills.library.policies.releases import release
@@ -176,10 +175,10 @@ def test_a_withdrawal_closes_the_session_with_the_reason(posed: Service):
 def test_an_erasure_and_the_end_of_consent_close_the_session(posed: Service):
     with opened(posed) as socket:
         with posed.database.writing() as session:
-            put_surgeon(session, "kestrel", {"consent": {"uses": ["atlas"]}}, "test")
+            cases.agree(session, {"uses": ["atlas"]})
         assert closed(socket)[0] in (WITHDRAWN, FORBIDDEN)
     with posed.database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": {"uses": ["training"]}}, "test")
+        cases.agree(session, {"uses": ["training"]})
         release(session, find_version(session, "kestrel", cases.SUTURE, 1), "test")
     with opened(posed) as socket:
         with posed.database.writing() as session:

@@ -7,7 +7,8 @@ import pytest
 
 from skills.errors import Busy
 from skills.library.operation import proofs
-from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.people.surgeons import find_surgeon, put_surgeon
+from skills.schemas.people import SurgeonIn
 from skills.transparency.signing_keys import SigningKey
 from tests.api.service import KESTREL, POLICY, Service, assert_problem
 from tests.independent_history import check_envelope, root_in
@@ -68,7 +69,7 @@ def test_new_rows_are_signed_first_and_keep_the_first_head_covering_them(
 ):
     def added(slug: str) -> tuple[str, int]:
         with trained.database.writing() as session:
-            put_surgeon(session, slug, {}, "test")
+            put_surgeon(session, slug, SurgeonIn(), "test")
             return "surgeons", find_surgeon(session, slug).row
 
     first = added("heron")

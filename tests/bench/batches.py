@@ -35,11 +35,13 @@ from skills.learning.certificate import Certificate, Coverage, certify
 from skills.learning.policy import LEARNER_VERSION, describe_learner, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation.jobs import PART, attempts_to_submit
-from skills.library.people.catalogue import put_surgeon, seed_catalogue
+from skills.library.people.surgeons import put_surgeon
+from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import Lesson, learn_style, lessons
 from skills.library.recordings.demos import upload_demo
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from skills.schemas.training import RetrainingIn
 from skills.serving import environment
 from skills.settings import Settings
@@ -111,7 +113,7 @@ def fill(file: Path, styles: int) -> list[tuple[RewardMap, Lesson]]:
     database = Database(f"sqlite:///{file}")
     database.migrate()
     with database.writing() as session:
-        seed_catalogue(session)
+        seed_suture_types(session)
     with database.reading() as session:
         sutures = session.scalars(select(SutureType.slug)).all()
     names = ((f"surgeon-{number}", suture) for number in count() for suture in sutures)
@@ -119,7 +121,7 @@ def fill(file: Path, styles: int) -> list[tuple[RewardMap, Lesson]]:
         [(FIRST, sutures[0]), *islice(names, styles)], inside(styles + 1), strict=True
     ):
         with database.writing() as session:
-            put_surgeon(session, surgeon, {}, "bench")
+            put_surgeon(session, surgeon, SurgeonIn(), "bench")
         data = cases.table(tip_mm, rate_hz=RATE_HZ)
         upload_demo(database, cases.upload(data), DemoIn(surgeon=surgeon, suture=suture, grid="paper"), "bench")
     with database.reading() as session:

@@ -7,8 +7,8 @@ from skills.kinematics import POINTING_DOWN, inverse, matrix_of
 from skills.planning.handoff import PsmM, realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification.clearance import clearance_between, clearance_to_pad, links_of
-from skills.verification.monte_carlo import doubt
-from skills.verification.probabilities import DoubtSettings
+from skills.verification.monte_carlo import estimate_success
+from skills.verification.probabilities import EstimateSettings
 from tests.bench.timing import best_s, in_turn
 
 ROUNDS = 3
@@ -23,14 +23,16 @@ PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-15, 60, -125], [-10, 55,
 
 def doubting(table: Table) -> None:
     """Vary a pass, alone and with PSM_M."""
-    settings = DoubtSettings()
+    settings = EstimateSettings()
     for name, psm_m in (("alone", None), ("beside PSM_M", PSM_M)):
         one = _motion(psm_m)
-        poses = settings.variations * doubt(one, approach_m=PSM_M.approach, pad_top_mm=PAD_TOP_MM).looked_at[0]
+        poses = (
+            settings.variations * estimate_success(one, approach_m=PSM_M.approach, pad_top_mm=PAD_TOP_MM).looked_at[0]
+        )
         samples = np.resize(np.arange(len(one)), poses)
         tip, turned = one.tip_mm[samples], matrix_of(one.rotation_xyzw)[samples]
         took, solving = in_turn(
-            lambda: doubt(one, approach_m=PSM_M.approach, pad_top_mm=PAD_TOP_MM),  # noqa: B023
+            lambda: estimate_success(one, approach_m=PSM_M.approach, pad_top_mm=PAD_TOP_MM),  # noqa: B023
             lambda: inverse(tip, turned),  # noqa: B023
             rounds=ROUNDS,
         )

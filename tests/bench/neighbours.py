@@ -21,7 +21,6 @@ from skills.db.models import Demonstration, MeasuredShape, StoredRecording, Surg
 from skills.db.packed import pack
 from skills.db.session import Database
 from skills.library.comparison.neighbours import nearest_to
-from skills.library.people.catalogue import put_surgeon
 from skills.packing import sha256
 from tests import backends
 from tests.bench import recognition
@@ -106,7 +105,7 @@ def of_library(table: Table, real: np.ndarray) -> None:
         spent, _ = timed(lambda: nearest_to(database, names[0], NEIGHBOURS))
         table.add_row("with one more", str(spent), spent.share_of(MORE_S))
         with database.writing() as session:
-            put_surgeon(session, cohorts.name(1), {"consent": {"uses": [], "until": None}}, "test")
+            cases.agree(session, {"uses": [], "until": None}, cohorts.name(1))
         spent, found = timed(lambda: nearest_to(database, names[0], NEIGHBOURS))
         table.add_row("after a consent ended", str(spent), f"{found.searched + 1} left")
         database.close()

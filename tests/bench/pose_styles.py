@@ -25,7 +25,8 @@ from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.segments import propose_segments
 from skills.learning.evaluation import dtw
-from skills.learning.pose_style import PHASES, PoseStyle, laid_rotations, laid_tip, learn_pose_style, mean_rotation
+from skills.learning.pose_style import PHASES, PoseStyle, laid_rotations, laid_tip, learn_pose_style
+from skills.quaternions import mean_rotation
 from tests.bench.recognition import TASKS, recordings
 from tests.bench.timing import best_s
 

@@ -20,7 +20,7 @@ from sqlalchemy.orm import Session
 
 from skills.db.session import Database
 from skills.library.policies.retraining import request_retraining
-from skills.library.recordings.recordings import store_recording, tell_upload
+from skills.library.recordings.recordings import parse_upload, store_recording
 from skills.schemas.training import RetrainingIn
 from tests import backends
 from tests.library import cases, hospital
@@ -141,7 +141,7 @@ def one_at_a_time() -> None:
 
 def upload_on(database: Database, number: int) -> Iterator[None]:
     """Upload recordings of other bytes and the same content."""
-    told = tell_upload(cases.upload(cases.hand_off()))
+    told = parse_upload(cases.upload(cases.hand_off()))
     yield
     while True:
         sent = cases.upload(os.urandom(16) + bytes(RECORDING_BYTES), "text/csv")

@@ -141,7 +141,7 @@ def test_a_copy_under_another_name_hides_no_stranger():
     numbers = np.append(numbers, numbers[[7]], axis=0)
     found = validate(numbers, np.append(drawn.surgeons, 99), np.append(drawn.sessions, 99), np.arange(len(numbers)))
     without = validate(numbers[:-1], drawn.surgeons, drawn.sessions, np.arange(len(drawn.surgeons)))
-    assert found.telling[1] > 0.5 * without.telling[1] > 0.0
+    assert found.stranger_fit[1] > 0.5 * without.stranger_fit[1] > 0.0
 
 
 def test_one_that_was_tested_is_recognised_as_it_was():

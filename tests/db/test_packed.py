@@ -35,7 +35,7 @@ from skills.learning.max_ent_irl import MaxEntIRL
 from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.learning.ties import ShortestWay
+from skills.learning.ties import ShortestApproach
 from skills.learning.tube import certified_poses
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.motion_laws import Poses
@@ -128,7 +128,7 @@ VALUES = [
     DDPG(),
     TRPO(),
     replace(PHASED, ties=None),
-    replace(PHASED, ties=ShortestWay(depth_along=(0.0, 0.1, -1.0))),
+    replace(PHASED, ties=ShortestApproach(depth_along=(0.0, 0.1, -1.0))),
     replace(PHASED, ties=None, surroundings=Surroundings(SCENE)),
     replace(POLICY, network=always((0.5, -0.25, 1e-30))),
     replace(PLAN, psm_m=None),

@@ -16,7 +16,7 @@ from skills.library.operation import jobs
 from skills.library.operation.installation import count_jobs
 from skills.library.operation.overview import newest_job
 from skills.library.operation.styles import matrix, released_styles
-from skills.library.people import catalogue
+from skills.library.people import surgeons, suture_types
 from skills.library.policies import batches, retraining, training, versions
 from skills.library.recordings import demos, proposals
 from skills.schemas.training import RetrainingIn, TrainingIn
@@ -48,7 +48,7 @@ def filled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def newest(session: Session) -> Any:
-    return demos.newest_demo(session, catalogue.find_surgeon(session, STYLE[0]).row, STYLE[1])
+    return demos.newest_demo(session, surgeons.find_surgeon(session, STYLE[0]).row, STYLE[1])
 
 
 def served(session: Session) -> Any:
@@ -62,9 +62,9 @@ def batch(session: Session) -> Any:
 
 
 HOT: dict[str, Callable[[Session], object]] = {
-    "a surgeon": lambda s: catalogue.find_surgeon(s, STYLE[0]),
-    "surgeons": lambda s: catalogue.list_surgeons(s, 10, None),
-    "surgeons, further on": lambda s: catalogue.list_surgeons(s, 10, "surgeon-0002"),
+    "a surgeon": lambda s: surgeons.find_surgeon(s, STYLE[0]),
+    "surgeons": lambda s: surgeons.list_surgeons(s, 10, None),
+    "surgeons, further on": lambda s: surgeons.list_surgeons(s, 10, "surgeon-0002"),
     "demonstrations": lambda s: demos.list_demos(s, 10, None, None, None),
     "demonstrations, further on": lambda s: demos.list_demos(s, 10, 30, None, None),
     "demonstrations of a surgeon": lambda s: demos.list_demos(s, 10, 30, STYLE[0], None),
@@ -146,7 +146,7 @@ def test_the_figures_are_counted_in_an_index_alone(filled: Database):
 def test_an_index_that_is_missing_is_noticed(filled: Database):
     with filled.reading() as session, noted(session) as asked:
         session.execute(text("DROP INDEX ix_demonstrations_suture"))  # rolled back at the end of this transaction
-        find = catalogue.find_suture_type(session, STYLE[1])
+        find = suture_types.find_suture_type(session, STYLE[1])
         asked.clear()
         demos.list_demos(session, 10, None, None, find.slug)  # no plan of this query was cached before
         assert [wasteful(session, *one) for one in asked] != [[]]

@@ -23,6 +23,7 @@ from skills.formats.reader_process import KNOWN, ConfinedReader, Refusal
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer
 from tests.formats import bags
+from tests.formats.confined import on, read
 
 LIMITS = ProcessLimits(
     memory_bytes=512 << 20, wall_s=20.0, cpu_s=20, file_bytes=64 << 20, answer_bytes=32 << 20, threads=False
@@ -35,20 +36,7 @@ TABLE = b"t_s,x_mm,y_mm,z_mm,jaw_rad\n" + b"".join(b"%f,1,2,-100.5,0.25\n" % (k 
 @pytest.fixture(scope="module")
 def reader(reading_server: ForkServer) -> ConfinedReader:
     reading_server.start()
-    return on(reading_server, at_once=4)
-
-
-def on(server: ForkServer, limits: ProcessLimits = LIMITS, **how: Any) -> ConfinedReader:
-    """Return a reader on a fork server that runs already; `reader` tests that one starts its own."""
-    made = ConfinedReader(limits, **{"at_once": 1, **how})
-    made.server = server
-    return made
-
-
-def read(reader: ConfinedReader, data: bytes, **how: Any) -> values.Recording:
-    with tempfile.TemporaryFile() as file:
-        file.write(data)
-        return reader(file, **how)
+    return on(reading_server, LIMITS, at_once=4)
 
 
 def same(one: Any, other: Any) -> bool:
@@ -82,9 +70,7 @@ def test_what_is_told_is_the_same_to_the_last_bit(reader, data, how):
         file.write(data)
         told = reader.parse(file, **how)
     assert same(parse_recording(io.BytesIO(data), **how), told)
-    assert told.about["segments"] == [
-        vars(one) | {"reasons": list(one.reasons), "reason": one.reason} for one in told.proposed
-    ]
+    assert told.about.segments == list(told.proposed)
 
 
 @pytest.mark.parametrize(

@@ -1,51 +1,29 @@
 """Small hostile files cost little, in every format: a reader refuses them with a message or is soon stopped."""
 
 import io
-import os
 import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
 from skills.errors import SkillsError, UnreadableRecording
 from skills.formats import read_recording
 from skills.formats.reader_process import ConfinedReader
-from skills.sandbox import ProcessLimits
-from skills.sandbox.forked import ForkServer
 from tests.formats import costly
+from tests.formats.confined import cpu_s, read
 
 MOST_CPU_S = 5.0  # for a file below 1 MB
-LIMITS = ProcessLimits(
-    memory_bytes=1 << 30, wall_s=60.0, cpu_s=30, file_bytes=1 << 30, answer_bytes=256 << 20, threads=False
-)
-
-
-@pytest.fixture(scope="module")
-def reader(reading_server: ForkServer) -> ConfinedReader:
-    reader = ConfinedReader(LIMITS, at_once=1)
-    reader.server = reading_server
-    reader.server.start()
-    return reader
-
-
-def cpu_s(reader: ConfinedReader) -> float:
-    """Return the processor time of all forks so far."""
-    fields = Path(f"/proc/{reader.server.pid}/stat").read_text().rpartition(")")[2].split()
-    return sum(map(int, fields[13:15])) / os.sysconf("SC_CLK_TCK")  # cutime and cstime of proc(5)
 
 
 def cost_s(reader: ConfinedReader, data: bytes) -> tuple[float, str]:
     """Read a file; return the processor time in seconds, and the message of its refusal."""
     assert len(data) < 1_000_000
-    began = cpu_s(reader) if reader.server.pid else 0.0
-    with tempfile.TemporaryFile() as file:
-        file.write(data)
-        try:
-            reader(file)
-            said = ""
-        except SkillsError as refused:
-            said = str(refused)
+    began = cpu_s(reader)
+    try:
+        read(reader, data)
+        said = ""
+    except SkillsError as refused:
+        said = str(refused)
     return cpu_s(reader) - began, said
 
 

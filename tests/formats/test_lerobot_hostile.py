@@ -1,12 +1,10 @@
 """Damaged and hostile LeRobot episodes: refused within limits, or read as exactly their content."""
 
 import io
-import os
 import random
 import stat
 import subprocess
 import sys
-import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -22,38 +20,16 @@ from skills.errors import SkillsError, UnreadableRecording
 from skills.formats import read_recording
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.reader_process import ConfinedReader
-from skills.sandbox import ProcessLimits
-from skills.sandbox.forked import ForkServer
 from tests.formats import hostile, lerobots
+from tests.formats.confined import cpu_s, read
 from tests.formats.lerobots import columns_of, episode, packed, parquet, poses
 from tests.formats.others import damaged, zipped
 
 MOST_CPU_S = 2.0
-LIMITS = ProcessLimits(
-    memory_bytes=1 << 30, wall_s=60.0, cpu_s=30, file_bytes=1 << 30, answer_bytes=256 << 20, threads=False
-)
-
-
-@pytest.fixture(scope="module")
-def reader(reading_server: ForkServer) -> ConfinedReader:
-    reader = ConfinedReader(LIMITS, at_once=1)
-    reader.server = reading_server
-    reader.server.start()
-    return reader
-
-
-def cpu_s(reader: ConfinedReader) -> float:
-    """Return the processor time of all forks so far."""
-    if not reader.server.pid:
-        return 0.0
-    fields = Path(f"/proc/{reader.server.pid}/stat").read_text().rpartition(")")[2].split()
-    return sum(map(int, fields[13:15])) / os.sysconf("SC_CLK_TCK")  # cutime and cstime of proc(5)
 
 
 def confined(reader: ConfinedReader, data: bytes) -> Recording:
-    with tempfile.TemporaryFile() as file:
-        file.write(data)
-        return reader(file, frame="ECM")
+    return read(reader, data, frame="ECM")
 
 
 def same(one: Recording, other: Recording) -> bool:

@@ -13,10 +13,7 @@ from skills.seeds.recordings import sample_recordings
 from tests.formats import bags, lerobots, trials
 from tests.library import cases
 
-DIGESTS = {
-    1: "f3e12fe5a106fc4ba531a9b17296658d5a2755c9c03d4fb2686dbec595e059f2",
-    2: "27621a3dc6d3e84ac285557d1e3b52e56c786442effcc6d51ac95b012f130e9a",  # transfers
-}
+DIGESTS = {1: "d85188129dfe550f0bb8f295f56668af15106c1c8f99c8b5e3f9ef723e376df7"}
 FILES: list[tuple[bytes, dict[str, Any]]] = [
     (sample_recordings()[0].data, {}),
     (bags.pose_bag(bags.straight(40)), {}),

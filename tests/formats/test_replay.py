@@ -30,7 +30,7 @@ from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, OPEN_RA
 from skills.planning.trajectory import time_parametrise
 from tests.formats.replays import FRAME, PSM1, PSM2, RATE_HZ, arm, checked, members, papers, trajectory, unpacked
 from tests.planning.motions import hand_off
-from tests.planning.test_transfers import BESIDE
+from tests.planning.test_trajectory import BESIDE
 
 
 def kept_by_the_robots_script(read: list[tuple[str, Any]], topic: str) -> tuple[list[Any], int]:

@@ -18,6 +18,7 @@ from skills.formats.join import join
 from skills.formats.mcap import read_mcap
 from skills.formats.parsed import parse
 from skills.formats.reader_process import KNOWN
+from skills.schemas.recordings import Setpoints
 from tests.formats import lerobots, written
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, assert_same, recording
 from tests.formats.others import NOETIC, rosbag1, whole
@@ -313,9 +314,9 @@ def test_setpoints_pass_between_processes_unchanged():
 
 
 def test_setpoints_are_described_where_there_are_any():
-    assert parse(recording()).about["setpoints"] == []
-    assert parse(whole()).about["setpoints"] == [
-        {"arm": "PSM2", "topic": TIP, "frame": "PSM2_base", "samples": 10},
-        {"arm": "PSM2", "topic": "/PSM2/setpoint_cp", "frame": "ECM", "samples": 10},
-        {"arm": "PSM2", "topic": JAW, "frame": None, "samples": 10},
+    assert parse(recording()).about.setpoints == []
+    assert parse(whole()).about.setpoints == [
+        Setpoints("PSM2", TIP, "PSM2_base", 10),
+        Setpoints("PSM2", "/PSM2/setpoint_cp", "ECM", 10),
+        Setpoints("PSM2", JAW, None, 10),
     ]

@@ -12,7 +12,6 @@ from skills.formats.bag_writer import write_messages
 from skills.formats.reader_process import ConfinedReader
 from skills.formats.suture_points import READ, SuturePoints, read_scene, suture_points
 from skills.kinematics import matrix_of, quaternion_of
-from skills.sandbox import ProcessLimits
 
 START_NS = 1_760_000_000_000_000_000
 HALF = np.sqrt(0.5)
@@ -172,13 +171,10 @@ def test_a_file_that_is_cut_off_is_refused_at_every_length():
             read_scene(io.BytesIO(whole[:size]))
 
 
-def test_it_is_read_in_a_process_of_its_own_and_refusals_come_back():
-    limits = ProcessLimits(
-        memory_bytes=512 << 20, wall_s=20.0, cpu_s=20, file_bytes=64 << 20, answer_bytes=32 << 20, threads=False
-    )
-    with ConfinedReader(limits, at_once=2) as read, tempfile.TemporaryFile() as file:
+def test_it_is_read_in_a_process_of_its_own_and_refusals_come_back(reader: ConfinedReader):
+    with tempfile.TemporaryFile() as file:
         file.write(scene(world()))
-        assert suture_points(read(file, target=READ)) == found(world())
+        assert suture_points(reader(file, target=READ)) == found(world())
         file.truncate(200)
         with pytest.raises(UnreadableRecording, match="truncated"):
-            read(file, target=READ)
+            reader(file, target=READ)

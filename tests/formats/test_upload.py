@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from skills.errors import BadInput, UnreadableRecording
 from skills.formats import read_recording, write_mcap
 from skills.formats.bag_writer import DEFINITIONS, Message, messages_of, write_bag, write_messages
-from skills.formats.upload import find_bag, lighten, ready_to_send, topics_of
+from skills.formats.upload import copy_without_pictures, find_bag, prepare_upload, topics_of
 from tests.formats.bags import START_NS, STEP_NS, assert_same, recording
 from tests.formats.others import db3, rosbag1
 
@@ -44,7 +44,7 @@ def mcap(said) -> bytes:
 
 
 def sent_from(path: Path) -> tuple[str, bytes]:
-    with ready_to_send(find_bag(path)) as file:
+    with prepare_upload(find_bag(path)) as file:
         return file.name, file.read_bytes()
 
 
@@ -206,7 +206,7 @@ def test_a_large_bag_is_streamed(tmp_path):
     tracemalloc.start()
     began = time.process_time()
     with (tmp_path / "out.mcap").open("wb") as out:
-        lighten([path], out, {})
+        copy_without_pictures([path], out, {})
     took, (_, peak) = time.process_time() - began, tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 20 << 20

@@ -35,9 +35,10 @@ def walked(data: bytes):
     """Walk over a complete file: the walker, and channel, log time and content of every message."""
     walk = Walker(io.BytesIO(data))
     said = [
-        (stretch.channel.topic, log_ns_of(stretch.data, begin), bytes(stretch.data[begin : begin + length]))
-        for stretch in walk.stretches()
-        for begin, length in zip(stretch.begin, stretch.length, strict=True)
+        (walk.channels[number].topic, log_ns_of(part.data, begin), bytes(part.data[begin : begin + length]))
+        for part in walk.parts()
+        for number in part.numbers
+        for begin, length in zip(*part.of(number), strict=True)
     ]
     return walk, said
 
@@ -337,5 +338,5 @@ def test_a_long_attachment_is_read_a_block_at_a_time():
             return super().read(size)
 
     file = Counted(whole(record(records.ATTACHMENT, bytes(5 << 20)) + DEFINED + ONE))
-    assert sum(len(stretch.begin) for stretch in Walker(file).stretches()) == 1
+    assert sum(len(part.chain.messages) for part in Walker(file).parts()) == 1
     assert 0 < Counted.largest <= 1 << 20

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, MixedFrames
-from skills.learning.pose_style import PHASES, learn_pose_style, mean_rotation
+from skills.learning.pose_style import PHASES, learn_pose_style
 from skills.learning.tube import certified_poses
+from skills.quaternions import mean_rotation
 from tests.bench.pose_styles import drawn, interval, laid_medoid, left_out, line, motions, ours, surgeons
 from tests.by_day import some
 

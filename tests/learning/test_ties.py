@@ -18,14 +18,14 @@ from skills.learning.certificate import certify, mdp_of
 from skills.learning.dynamic_programming import ValueIteration, exact_q
 from skills.learning.policy import Policy, learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.ties import REMOTE_CENTRE, ShortestWay, rule_in
+from skills.learning.ties import REMOTE_CENTRE, ShortestApproach, rule_in
 from tests.by_day import examples, some
 from tests.gridworld.paths import WALKS, learnt, named_path, random_path
 from tests.learning.loops import run_both
 
 STEPS = [Decimal(n).sqrt() for n in range(4)]
-DOWN = ShortestWay(depth_along=(0.0, -1.0, -2.0))
-FLAT = ShortestWay()
+DOWN = ShortestApproach(depth_along=(0.0, -1.0, -2.0))
+FLAT = ShortestApproach()
 every_walk = pytest.mark.parametrize("name", some(WALKS, 4))
 
 
@@ -129,7 +129,7 @@ def test_by_hand_the_shortest_of_equally_good_ways_goes_straight():
 
 def test_by_hand_the_shallower_of_equally_short_ways_is_taken():
     path = straight((8, 1, 4), [(0, 0, 3), (1, 0, 3)])
-    up, down = (with_ties(path, ShortestWay(depth_along=(0.0, 0.0, sign))) for sign in (-1.0, 1.0))
+    up, down = (with_ties(path, ShortestApproach(depth_along=(0.0, 0.0, sign))) for sign in (-1.0, 1.0))
     # Two of five moves from (6, 0, 1) rise: at once where a low cell is deep, at the end where a high one is.
     assert approach(up, (6, 0, 1))[:, 2].tolist() == [1, 2, 3, 3, 3, 3]
     assert approach(down, (6, 0, 1))[-1].tolist() == [1, 0, 3]
@@ -211,7 +211,7 @@ def test_in_the_papers_state_the_lowest_index_counts():
 def test_the_frame_decides_how_depth_is_measured():
     assert rule_in("PSM1_base") == rule_in("PSM2_base", [0, 0, 1]) == REMOTE_CENTRE
     assert rule_in("camera") == FLAT
-    assert rule_in("camera", [0, 0, 2]) == ShortestWay(depth_along=(0.0, 0.0, 2.0))
+    assert rule_in("camera", [0, 0, 2]) == ShortestApproach(depth_along=(0.0, 0.0, 2.0))
     for wrong in ([0, 0], [0, 0, 1, 5]):
         with pytest.raises(BadSettings, match="three finite numbers"):
             rule_in("camera", wrong)
@@ -229,7 +229,7 @@ def test_the_frame_decides_how_depth_is_measured():
 )
 def test_a_depth_that_cannot_be_measured_is_refused(given_to, says):
     with pytest.raises(BadSettings, match=says):
-        ShortestWay(**given_to)
+        ShortestApproach(**given_to)
 
 
 def test_depths_are_those_of_the_centres():

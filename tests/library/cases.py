@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, Plan, PolicyVersion
 from skills.db.service_tables import Job
@@ -20,7 +21,8 @@ from skills.jobs.workflows import Work
 from skills.learning.policy import describe_learner
 from skills.learning.q_learning import CellQLearning
 from skills.library.operation.jobs import BATCH
-from skills.library.people.catalogue import put_surgeon, seed_catalogue
+from skills.library.people.surgeons import put_surgeon
+from skills.library.people.suture_types import seed_suture_types
 from skills.library.perform import perform_job
 from skills.library.plans.plans import plan_sutures
 from skills.library.policies.training import request_training
@@ -28,6 +30,7 @@ from skills.library.recordings.demos import upload_demo
 from skills.library.recordings.recordings import Upload
 from skills.packing import sha256
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from skills.schemas.plans import PlanIn
 from skills.schemas.training import TrainingIn
 from skills.settings import Settings
@@ -72,8 +75,13 @@ def upload(data: bytes, media_type: str = "text/csv", **how: Any) -> Upload:
 
 def add_surgeon(database: Database, slug: str = "kestrel", **about: Any) -> None:
     with database.writing() as session:
-        seed_catalogue(session)
-        put_surgeon(session, slug, about, "test")
+        seed_suture_types(session)
+        put_surgeon(session, slug, SurgeonIn.model_validate(about), "test")
+
+
+def agree(session: Session, consent: Any, surgeon: str = "kestrel") -> None:
+    """Record a surgeon's consent, and nothing else of the surgeon."""
+    put_surgeon(session, surgeon, SurgeonIn(consent=consent), "test")
 
 
 def add_demo(database: Database, data: bytes | None = None, surgeon: str = "kestrel", **cut: Any) -> Demonstration:

@@ -28,9 +28,10 @@ from skills.db.service_tables import Event, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.library.operation.integrity import demo_identity
 from skills.library.operation.jobs import BATCH, PART, identity_of
-from skills.library.people.catalogue import put_suture_type
+from skills.library.people.suture_types import put_suture_type
 from skills.library.policies.retraining import MOST_IN_A_PART
 from skills.packing import canonical, sha256
+from skills.schemas.people import SutureTypeIn
 from tests.library import cases
 
 FIRST = "kestrel"
@@ -49,7 +50,7 @@ def fill(database: Database, surgeons: int) -> list[Style]:
     cases.train(database, release=True)
     with database.writing() as session:
         about = {"name": "Barbed running", "also_called": [], "family": "running", "description": "Without a knot."}
-        put_suture_type(session, "barbed-running", about, "test")
+        put_suture_type(session, "barbed-running", SutureTypeIn.model_validate(about), "test")
     with database.reading() as session:
         sutures = session.scalars(select(SutureType.slug).order_by(SutureType.slug)).all()
     assert len(sutures) == SUTURES

@@ -10,12 +10,15 @@ from skills.db.session import Database
 from skills.formats.parsed import parse_recording
 from skills.learning.policy import describe_learner
 from skills.library.operation.jobs import PART
-from skills.library.people.catalogue import put_surgeon, seed_catalogue
+from skills.library.people.surgeons import put_surgeon
+from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies.retraining import request_retraining
 from skills.library.recordings import demos
+from skills.library.recordings.content_cache import entry_of
 from skills.library.recordings.demos import Made, make_demo
-from skills.library.recordings.recordings import entry_of, find_recording, keep
+from skills.library.recordings.recordings import find_recording, put_recording
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from skills.schemas.training import RetrainingIn
 from tests.library import cases
 
@@ -25,7 +28,7 @@ NO_CONSENT = {"consent": {"uses": ["atlas"], "until": None}}
 def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
     """Add a number of styles, twelve per surgeon; return their surgeons and suture types."""
     with database.writing() as session:
-        seed_catalogue(session)
+        seed_suture_types(session)
     with database.reading() as session:
         sutures = session.scalars(select(SutureType.slug).order_by(SutureType.slug)).all()
     pairs = ((f"surgeon-{n}", suture) for n in count() for suture in sutures)
@@ -33,7 +36,7 @@ def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
     made, sha256 = made_once(database)
     with database.writing() as session:
         for surgeon in sorted({surgeon for surgeon, _ in styles}):
-            put_surgeon(session, surgeon, {}, "test")
+            put_surgeon(session, surgeon, SurgeonIn(), "test")
         stored = find_recording(session, sha256)
         for surgeon, suture in styles:
             demos._store_demo(session, stored, made, DemoIn(surgeon=surgeon, suture=suture), "test")
@@ -44,7 +47,7 @@ def made_once(database: Database) -> tuple[Made, str]:
     upload = cases.upload(cases.hand_off())
     told = parse_recording(upload.file)
     with database.writing() as session:
-        keep(session, upload, told, entry_of(upload, told), "test")
+        put_recording(session, upload, told, entry_of(upload, told), "test")
     return make_demo(told, DemoIn(surgeon="anybody", suture=cases.SUTURE)), upload.sha256
 
 

@@ -96,7 +96,7 @@ def test_a_published_recording_has_bands_that_hold_what_they_say():
     assert found.errors.tip_bias_mm == pytest.approx(1.47, abs=0.05)
     assert np.mean([one.assumed_coverage for one in found.tracked]) < 0.5
     assert np.mean([one.coverage for one in found.tracked]) == pytest.approx(0.9, abs=0.05)
-    assert "of the encoders and not of the tip" in found.in_words
+    assert "of the encoders and not of the tip" in found.describe()
 
 
 def test_a_published_recording_slips_in_small_cells_alone():
@@ -127,7 +127,7 @@ def test_a_trackers_topic_in_a_bag_shows_the_tips_constant_error(tmp_path: Path)
     found = calibrate_arm(measured, name="ours")
     assert found.errors.tip_bias_mm == pytest.approx(CABLES_MM, rel=0.25)
     assert found.errors.tip_noise_mm == pytest.approx(0.2, rel=0.15)
-    assert "The tracker shows the tip's" in found.in_words
+    assert "The tracker shows the tip's" in found.describe()
     ran = CliRunner().invoke(app, ["calibrate-arm", str(file), "--tracker", "/NDI/tool/measured_cp"])
     assert ran.exit_code == 0 and "tip, tracked z mm" in ran.output
 

@@ -16,11 +16,13 @@ from skills.db.session import Database
 from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import dtw
 from skills.library.comparison import atlas
+from skills.library.comparison import measured as cache
 from skills.library.comparison.atlas import atlas_of
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.releases import withdraw
 from skills.library.recordings.demos import withdraw_demo
+from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
@@ -42,13 +44,13 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
 def measured(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list that records how many pairs each call measures."""
     counted: list[int] = []
-    really = atlas.distances_of
+    really = cache.distances_of
 
     def count(shapes, pairs):
         counted.append(len(pairs))
         return really(shapes, pairs)
 
-    monkeypatch.setattr(atlas, "distances_of", count)
+    monkeypatch.setattr(cache, "distances_of", count)
     return counted
 
 
@@ -120,7 +122,7 @@ def test_the_atlas_uses_the_papers_measure_and_scaling_removes_size(database: Da
     np.testing.assert_allclose(far(scaled)[0, 3], dtw(one, other).total_mm / 100, atol=1e-4)
     assert (plain.unit, scaled.unit) == ("mm", "lengths of start to goal")
     (apart_by,) = plain.differences
-    assert apart_by.said.startswith(f"In the {apart_by.part}, the path of surgeon-0 is ")
+    assert apart_by.sentence.startswith(f"In the {apart_by.part}, the path of surgeon-0 is ")
     assert np.sum(apart_by.shares) == pytest.approx(1.0, abs=1e-3)
 
 
@@ -161,7 +163,7 @@ def test_the_shape_cache_may_be_dropped_and_other_versions_are_ignored(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     assert atlas_of(database, SUTURE) == first
-    monkeypatch.setattr(atlas, "VERSION", 0)
+    monkeypatch.setattr(cache, "VERSION", 0)
     assert atlas_of(database, SUTURE) == first
     assert measured == [6, 6] * 3
     with database.reading() as session:
@@ -177,8 +179,8 @@ def test_it_is_measured_in_blocks_and_kept_block_by_block(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     measured.clear()
-    monkeypatch.setattr(atlas, "PAIRS_AT_ONCE", 10)
-    monkeypatch.setattr(atlas, "DEMOS_AT_ONCE", 2)
+    monkeypatch.setattr(cache, "PAIRS_AT_ONCE", 10)
+    monkeypatch.setattr(cache, "DEMOS_AT_ONCE", 2)
     assert atlas_of(database, SUTURE) == whole
     assert sum(measured) == 2 * 36 and len(measured) > 4
 
@@ -198,7 +200,12 @@ def test_two_that_ask_at_once_measure_once(database: Database, measured: list[in
 def test_consent_is_asked_and_who_is_left_out_is_counted_and_not_named(database: Database):
     names = small(database)
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(1), {"consent": {"uses": ["training"], "until": None}}, "test")
+        put_surgeon(
+            session,
+            cohorts.name(1),
+            SurgeonIn.model_validate({"consent": {"uses": ["training"], "until": None}}),
+            "test",
+        )
     found = atlas_of(database, SUTURE)
     assert [one.id for one in found.demos] == names[:2]
     assert found.left_out.without_consent == 2
@@ -207,8 +214,18 @@ def test_consent_is_asked_and_who_is_left_out_is_counted_and_not_named(database:
     with pytest.raises(Conflict, match="does not cover atlas"):
         atlas_of(database, SUTURE, demo=names[2])
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(1), {"consent": {"uses": ["atlas"], "until": "2020-01-01"}}, "test")
-        put_surgeon(session, cohorts.name(0), {"consent": {"uses": ["training"], "until": None}}, "test")
+        put_surgeon(
+            session,
+            cohorts.name(1),
+            SurgeonIn.model_validate({"consent": {"uses": ["atlas"], "until": "2020-01-01"}}),
+            "test",
+        )
+        put_surgeon(
+            session,
+            cohorts.name(0),
+            SurgeonIn.model_validate({"consent": {"uses": ["training"], "until": None}}),
+            "test",
+        )
     with pytest.raises(NotFound, match="4 demonstrations, because the surgeon's consent"):
         atlas_of(database, SUTURE)
 
@@ -216,11 +233,11 @@ def test_consent_is_asked_and_who_is_left_out_is_counted_and_not_named(database:
 def test_who_comes_back_costs_only_the_pairs_that_are_missing(database: Database, measured: list[int]):
     names = small(database)
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(0), {"consent": {"uses": [], "until": None}}, "test")
+        cases.agree(session, {"uses": [], "until": None}, cohorts.name(0))
     atlas_of(database, SUTURE)
     assert measured == [1, 1]
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(0), {"consent": None}, "test")
+        cases.agree(session, None, cohorts.name(0))
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names
     assert measured == [1, 1, 5, 5]
 
@@ -231,7 +248,7 @@ def test_withdrawn_ones_are_not_in_it(database: Database):
         withdraw_demo(session, names[0], "test")
     found = atlas_of(database, SUTURE)
     assert [one.id for one in found.demos] == names[1:]
-    assert (found.recognition, found.votes, found.whose) == ([], None, None)
+    assert (found.recognition, found.votes, found.recognised) == ([], None, None)
     assert found.no_recognition_because is not None and "two sessions each" in found.no_recognition_because
     with pytest.raises(Conflict, match="withdrawn"):
         atlas_of(database, SUTURE, demo=names[0])
@@ -343,7 +360,7 @@ def test_erasure_leaves_nothing(database: Database, whole: bool):
 
 def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, monkeypatch: pytest.MonkeyPatch):
     names = small(database)
-    really = atlas.distances_of
+    really = cache.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -351,7 +368,7 @@ def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, mon
                 erase_surgeon(session, cohorts.name(0), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(atlas, "distances_of", erase_first)
+    monkeypatch.setattr(cache, "distances_of", erase_first)
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names[2:]
     with database.reading() as session:
         there = {*session.scalars(select(Demonstration.row))}

@@ -17,10 +17,11 @@ from skills.errors import Conflict, Corrupt, Erased
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import Erasures, erasures_of, keep_erasures, read_erasures
 from skills.library.operation.inspection import inspect_installation
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.versions import policy_of
 from skills.library.recordings.demos import withdraw_demo
+from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.api.service import Service
 from tests.jobs.house import House
@@ -218,7 +219,7 @@ def test_who_was_erased_after_the_backup_does_not_come_back(
     cases.train(database, canary, release=True)
     back_up(database, tmp_path / "b.zip")
     with database.writing() as session:
-        put_surgeon(session, "after-the-backup", {}, "test")
+        put_surgeon(session, "after-the-backup", SurgeonIn(), "test")
         for slug in (canary, "after-the-backup"):
             erase_surgeon(session, slug, "test")
         withdraw_demo(session, gone, "test")
@@ -235,7 +236,7 @@ def test_who_was_erased_after_the_backup_does_not_come_back(
             assert [s.slug for s in session.scalars(select(Surgeon))] == ["kestrel"]
             for slug in (canary, "after-the-backup"):
                 with pytest.raises(Erased):
-                    put_surgeon(session, slug, {}, "test")
+                    put_surgeon(session, slug, SurgeonIn(), "test")
         assert wrong(restored) == []
         assert erasures_of(restored).demos == {gone}
         if backend == "sqlite":

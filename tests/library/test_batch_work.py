@@ -9,11 +9,12 @@ from sqlalchemy import func, select
 from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.jobs.workflows import Work, fail, start
-from skills.library.people.catalogue import put_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job
 from skills.library.policies import batches, retraining
 from skills.library.policies.training import learn_style
 from skills.library.recordings.demos import withdraw_demo
+from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import (
@@ -55,7 +56,7 @@ def test_styles_without_consent_or_valid_demo_fail_and_the_others_continue(datab
     cases.add_demo(database, surgeon="heron")
     job = ask_retraining(database)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
         heron = cases.Demonstration.surgeon.has(slug="heron")
         withdraw_demo(session, session.scalars(select(cases.Demonstration).where(heron)).one().sha256, "test")
     for part in parts_of(database, job):

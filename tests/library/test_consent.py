@@ -16,10 +16,11 @@ from skills.formats.parsed import parse_recording
 from skills.library.comparison import atlas, scores
 from skills.library.operation import styles
 from skills.library.people import consent
-from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.consent import covered, may
+from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.plans import plans
 from skills.library.policies import batches, releases, retraining, training, versions
+from skills.schemas.people import Consent, SurgeonIn
 from skills.schemas.scores import ScoreIn
 from tests.library import cases
 from tests.library.cases import SUTURE
@@ -40,7 +41,7 @@ def on_one_day(monkeypatch: pytest.MonkeyPatch) -> None:
 def agree(database: Database, to: dict[str, Any] | None, surgeon: str = "kestrel") -> None:
     """Record a surgeon's consent."""
     with database.writing() as session:
-        put_surgeon(session, surgeon, {"consent": to}, "anna")
+        put_surgeon(session, surgeon, SurgeonIn.model_validate({"consent": to}), "anna")
 
 
 def served(database: Database) -> int | None:
@@ -264,9 +265,11 @@ def test_other_changes_of_a_surgeon_withdraw_nothing(database: Database):
     cases.add_demo(database)
     cases.train(database, release=True)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"skill_level": "novice", "consent": ALL}, "anna")
-        put_surgeon(session, "kestrel", {"consent": {"uses": ["training"], "until": None}}, "anna")
-        put_surgeon(session, "kestrel", {"consent": None}, "anna")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate({"skill_level": "novice", "consent": ALL}), "anna")
+        put_surgeon(
+            session, "kestrel", SurgeonIn.model_validate({"consent": {"uses": ["training"], "until": None}}), "anna"
+        )
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate({"consent": None}), "anna")
     assert served(database) == 1
 
 
@@ -274,7 +277,7 @@ def test_withdrawn_consent_withdraws_a_surgeons_combined_and_other_styles(databa
     demos = [cases.add_demo(database, cases.hand_off((0.0, 0.0, 1.0 * n))).sha256 for n in range(3)]
     cases.train(database, demos=demos, release=True)
     with database.writing() as session:
-        put_surgeon(session, "heron", {}, "test")
+        put_surgeon(session, "heron", SurgeonIn(), "test")
     other = cases.add_demo(database, surgeon="heron")
     cases.train(database, "heron", demos=[other.sha256], release=True)
     agree(database, NO_TRAINING)
@@ -308,7 +311,7 @@ def test_the_question_is_answered_alike_in_python_and_in_sql(
     ],
 )
 def test_a_refusal_says_what_the_consent_covers_or_when_it_ended(uses: list[str], until: str | None, why: str | None):
-    surgeon = SimpleNamespace(slug="kestrel", consent={"uses": uses, "until": until})
+    surgeon = SimpleNamespace(slug="kestrel", consent=Consent.model_validate({"uses": uses, "until": until}))
     assert may(surgeon, "training") is (why is None)
     refused = consent.refusal(surgeon, "training")
     assert (refused and str(refused)) == why
@@ -327,7 +330,7 @@ def test_a_day_ends_in_utc(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_surgeon_of_whom_nothing_was_ever_recorded_covers_everything(database: Database):
     with database.writing() as session:
-        put_surgeon(session, "plain", {}, "test")
+        put_surgeon(session, "plain", SurgeonIn(), "test")
     with database.reading() as session:
         plain = find_surgeon(session, "plain")
         assert may(plain, "training")

@@ -23,12 +23,13 @@ from skills.formats.reader_process import ConfinedReader
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.jobs import cancel, find_job, list_jobs
 from skills.library.people import consent
-from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.perform import perform_job
 from skills.library.recordings.datasets import delete_dataset, export_dataset, find_dataset
 from skills.library.recordings.demos import mark_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
+from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests.library import cases, exports
 from tests.library.exports import PASS_S, add, ask, export, kept, members, read_episode, session_of, zip_of
@@ -513,5 +514,5 @@ def test_a_dataset_is_hidden_with_any_of_its_surgeons(database: Database):
     assert zip_of(everybody, of_both)
     ask(seeing["wren"])  # all that wren may see
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": NO_EXPORT}, "anna")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate({"consent": NO_EXPORT}), "anna")
     assert ask(seeing["wren"]).request["episodes"] == 1

@@ -15,18 +15,19 @@ from skills.db.models import Demonstration, MeasuredShape, PolicyVersion, Record
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import Conflict, NotAllowed, NotFound
-from skills.library.comparison import atlas
+from skills.library.comparison import measured
 from skills.library.comparison.atlas import atlas_of
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.operation import sweep
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import erasures_of, keep_up_erasures, read_erasures
 from skills.library.operation.sweep import sweep_erased
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.recordings.demos import add_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.db.test_query_plans import noted, plan_of
@@ -41,14 +42,19 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
 
     def agrees(surgeon: int, to: list[str]) -> None:
         with database.writing() as session:
-            put_surgeon(session, cohorts.name(surgeon), {"consent": {"uses": to, "until": None}}, "test")
+            put_surgeon(
+                session,
+                cohorts.name(surgeon),
+                SurgeonIn.model_validate({"consent": {"uses": to, "until": None}}),
+                "test",
+            )
 
     cohorts.add_cohort(database, cohort(1, surgeons=3, sessions=1))
     agrees(1, [])
     atlas_of(database, cases.SUTURE)  # the first now has a distance from the third
     agrees(1, ["atlas"])
     agrees(2, [])
-    really = atlas.distances_of
+    really = measured.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -56,13 +62,13 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
                 erase_surgeon(session, cohorts.name(2), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(atlas, "distances_of", erase_first)
+    monkeypatch.setattr(measured, "distances_of", erase_first)
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         there = set(session.scalars(select(Demonstration.row)))
         kept = session.scalars(select(MeasuredShape)).all()
     assert {row for one in kept for row in one.measured.others.tolist()} <= there
-    monkeypatch.setattr(atlas, "distances_of", really)
+    monkeypatch.setattr(measured, "distances_of", really)
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         assert len(session.scalars(select(MeasuredShape)).all()) == 2

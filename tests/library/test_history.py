@@ -28,11 +28,12 @@ from skills.library.operation.history import Verified, sign_history, verify_hist
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.proofs import first_head, served_at
 from skills.library.people import erasure
-from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.erasure import erase_surgeon
+from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw
 from skills.library.recordings import recordings
 from skills.library.recordings.recordings import stored_recording
+from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from skills.transparency.merkle import Checkpoint, Tree, inclusion_proof, leaf_hash, node_from
 from skills.transparency.notes import read_notes
@@ -105,7 +106,7 @@ def test_a_transaction_that_fails_leaves_no_leaf(full: Database):
     with full.reading() as session:
         before = session.scalars(select(LEAVES.c.row)).all()
     with suppress(RuntimeError), full.writing() as session:
-        put_surgeon(session, "heron", {}, "test")
+        put_surgeon(session, "heron", SurgeonIn(), "test")
         raise RuntimeError
     with full.reading() as session:
         assert session.scalars(select(LEAVES.c.row)).all() == before
@@ -506,17 +507,17 @@ def test_signing_and_writing_do_not_wait_for_each_other(database: Database):
         return
     impatient = Database(database.url, patience_ms=200)
     with closing(impatient), database.writing([locks.surgeon("heron")]) as session:
-        put_surgeon(session, "heron", {}, "test")
+        put_surgeon(session, "heron", SurgeonIn(), "test")
         session.flush()
         database.history.settle(session.connection())  # its leaves have their rows
         with impatient.writing([locks.surgeon("egret")]) as other:
-            put_surgeon(other, "egret", {}, "test")
+            put_surgeon(other, "egret", SurgeonIn(), "test")
         assert sign_history(impatient) is not None
     signing = database.engine.execution_options(writes=()).connect()
     with closing(impatient), closing(signing):
         assert database.history.sign(signing) is not None  # and not committed yet
         with impatient.writing([locks.surgeon("swift")]) as other:
-            put_surgeon(other, "swift", {}, "test")
+            put_surgeon(other, "swift", SurgeonIn(), "test")
         signing.commit()
     sign_history(database)
     with database.reading() as session:
@@ -637,7 +638,7 @@ def test_without_its_key_the_history_is_neither_written_nor_verified(tmp_path: P
     with closing(Database(url, signing_key=key)) as database:
         database.migrate()
         with pytest.raises(NotReady, match="is missing"), database.writing() as session:
-            put_surgeon(session, "heron", {}, "test")
+            put_surgeon(session, "heron", SurgeonIn(), "test")
         assert "is missing" in wrong_in(database)[0][1]
     key.write_text(str(SigningKey(b"another" * 4 + b"key!")))
     with closing(Database(url, signing_key=key)) as database:

@@ -71,7 +71,7 @@ def test_no_two_keys_are_alike_and_one_owner_may_have_several(database: Database
     keys = [make(database) for _ in range(20)]
     assert len({key.split("_", 2)[2] for key in keys}) == 20
     with database.reading() as session:
-        assert {about_key(key)["owner"] for key in list_keys(session)} == {"anna"}
+        assert {about_key(key).owner for key in list_keys(session)} == {"anna"}
         assert len({holder.key for holder in (holder_of(session, key) for key in keys) if holder}) == 20
 
 
@@ -105,7 +105,7 @@ def test_a_key_that_runs_out_counts_until_that_moment(database: Database):
     with database.writing() as session:
         session.execute(update(Key).values(expires_at=now()))
     with database.reading() as session:
-        assert [about_key(one)["state"] for one in list_keys(session)] == ["expired"]
+        assert [about_key(one).state for one in list_keys(session)] == ["expired"]
         with pytest.raises(Conflict):
             refuse_without_keys(session)
 

@@ -24,13 +24,15 @@ from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.library import perform as library
 from skills.library.operation import jobs, styles
-from skills.library.people.catalogue import find_surgeon, put_surgeon, seed_catalogue
 from skills.library.people.erasure import erase_surgeon
+from skills.library.people.surgeons import find_surgeon, put_surgeon
+from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies import releases
 from skills.library.policies.versions import learnt, policy_of
 from skills.library.recordings.demos import add_demo, find_demo, withdraw_demo
 from skills.library.recordings.recordings import recording_bytes, store_recording
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
@@ -57,7 +59,7 @@ def counts(database: Database) -> dict[str, int]:
 
 def test_the_catalogue_is_seeded_once(database: Database):
     with database.writing() as session:
-        assert seed_catalogue(session) == 0
+        assert seed_suture_types(session) == 0
     assert counts(database)["suture_types"] == 11
 
 
@@ -66,7 +68,7 @@ def test_a_recording_is_looked_at_before_the_transaction_that_stores_it(
 ):
     begun: list[int] = []
     looked: list[bool] = []
-    writing, look = Database.writing, segments._look
+    writing, look = Database.writing, segments._analyse
 
     @contextmanager
     def watched(self: Database, names: Iterable[str] | None = None) -> Iterator[Session]:
@@ -82,7 +84,7 @@ def test_a_recording_is_looked_at_before_the_transaction_that_stores_it(
         return look(*given)
 
     monkeypatch.setattr(Database, "writing", watched)
-    monkeypatch.setattr(segments, "_look", seen)
+    monkeypatch.setattr(segments, "_analyse", seen)
     demo = cases.add_demo(database, cases.hand_off((7.5, 0.0, 0.0)))
     with writing(database) as session:
         session.execute(delete(ParsedRecording))
@@ -113,12 +115,12 @@ def test_hysteresis_is_kept_with_the_path_and_learnt_and_planned_with(database: 
         assert (kept.hysteresis, kept.path.hysteresis) == (0.25, 0.25)
         path, tip_mm = kept.path, kept.demo.tip_mm
     assert path.states.tolist() == discretize(tip_mm, PAPER_GRID, 0.25).states.tolist()
-    assert (demo.report["path_states"], demo.report["revisits"]) == (len(path.states), 0)
-    assert plain.report["revisits"] > 0
-    lost_mm = list(discretisation_rmse(tip_mm, PAPER_GRID, 0.25))
-    assert demo.report["discretisation_rmse_mm"] == lost_mm != plain.report["discretisation_rmse_mm"]
+    assert (demo.report.path_states, demo.report.revisits) == (len(path.states), 0)
+    assert plain.report.revisits > 0
+    lost_mm = tuple(discretisation_rmse(tip_mm, PAPER_GRID, 0.25))
+    assert demo.report.discretisation_rmse_mm == lost_mm != plain.report.discretisation_rmse_mm
     version = cases.train(database, demos=[demo.sha256], release=True)
-    assert version.manifest["metrics"]["discretisation_rmse_mm"] == lost_mm
+    assert version.manifest["metrics"]["discretisation_rmse_mm"] == list(lost_mm)
     assert version.manifest["metrics"]["exact_states"] == len(path.states)
     assert cases.add_plan(database).about["path"] == "fitted"
 
@@ -134,7 +136,7 @@ def test_a_hysteresis_that_cannot_be_meant_leaves_no_row(database: Database):
 def test_the_same_surgeon_eight_times_at_once_is_one_surgeon(database: Database):
     def put(_: int) -> None:
         with database.writing() as session:
-            put_surgeon(session, "heron", {}, "test")
+            put_surgeon(session, "heron", SurgeonIn(), "test")
 
     at_once(put)
     assert counts(database)["surgeons"] == 2

@@ -17,8 +17,8 @@ from skills.db.session import Database
 from skills.errors import Conflict, Erased, NotFound
 from skills.library.operation import jobs, locks
 from skills.library.operation.erasure_list import keep_up_erasures, read_erasures
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import delete_recording, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job
 from skills.library.policies.releases import release, standing
 from skills.library.policies.training import request_training, train_style
@@ -26,6 +26,7 @@ from skills.library.policies.versions import find_version
 from skills.library.recordings.demos import add_demo
 from skills.library.recordings.recordings import store_recording
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 from tests import backends
@@ -84,7 +85,7 @@ def perform(database: Database, job: Job) -> None:
 
 def put(database: Database, slug: str, **about: Any) -> bool:
     with database.writing([locks.surgeon(slug)]) as session:
-        return put_surgeon(session, slug, about, "test")[1]
+        return put_surgeon(session, slug, SurgeonIn.model_validate(about), "test")[1]
 
 
 def erase(database: Database) -> None:
@@ -111,7 +112,7 @@ def test_a_training_that_waits_for_a_withdrawn_consent_stores_nothing(database: 
         in_turn(
             database,
             KESTREL,
-            lambda session: put_surgeon(session, "kestrel", FORBIDDEN, "test"),
+            lambda session: put_surgeon(session, "kestrel", SurgeonIn.model_validate(FORBIDDEN), "test"),
             lambda: perform(database, job),
         )
     assert counts(database, PolicyVersion, Release) == [0, 0]
@@ -193,7 +194,10 @@ def test_an_equal_batch_at_once_gets_the_job_of_the_first(database: Database):
 def test_a_pseudonym_added_twice_at_once_is_one_surgeon(database: Database):
     osprey = [locks.surgeon("osprey")]
     assert not in_turn(
-        database, osprey, lambda session: put_surgeon(session, "osprey", {}, "test"), lambda: put(database, "osprey")
+        database,
+        osprey,
+        lambda session: put_surgeon(session, "osprey", SurgeonIn(), "test"),
+        lambda: put(database, "osprey"),
     )
     assert counts(database, Surgeon) == [2]
 
@@ -260,7 +264,7 @@ def test_the_last_two_parts_of_a_batch_end_it_once(database: Database, monkeypat
 def test_writers_for_other_surgeons_do_not_wait(database: Database):
     cases.add_surgeon(database, "osprey")
     with ThreadPoolExecutor(1) as pool, database.writing(KESTREL) as session:
-        put_surgeon(session, "kestrel", {"skill_level": "expert"}, "test")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate({"skill_level": "expert"}), "test")
         session.flush()
         stored = pool.submit(cases.add_demo, database, surgeon="osprey").result()  # committed while this is open
     assert stored.surgeon.slug == "osprey"

@@ -16,7 +16,6 @@ from skills.db.session import Database
 from skills.errors import BadPath, Conflict, NotFound
 from skills.library.comparison import neighbours
 from skills.library.comparison.neighbours import forget_gone, nearest_to
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.recordings.demos import withdraw_demo
 from tests import backends
@@ -44,7 +43,7 @@ def found(database: Database, demo: str, count: int = 10, **how: bool) -> list[s
 
 
 def held(database: Database) -> int:
-    return sum(len(one.index) for one in neighbours._held[database.engine].values())
+    return sum(len(one.index) for one in neighbours._indices[database.engine].values())
 
 
 @pytest.mark.parametrize("scaled", [False, True])
@@ -81,7 +80,7 @@ def test_a_consent_acts_at_once_in_both_directions(database: Database, names: li
 
     def agree(uses: list[str]) -> None:
         with database.writing() as session:
-            put_surgeon(session, cohorts.name(1), {"consent": {"uses": uses, "until": None}}, "test")
+            cases.agree(session, {"uses": uses, "until": None}, cohorts.name(1))
 
     agree(["training"])
     assert {*found(database, names[0])} == {names[1], *names[4:]} and held(database) == 4

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -23,13 +24,13 @@ from skills.library.comparison import scores
 from skills.library.operation import views
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import inspect_installation
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_surgeon
-from skills.library.recordings import recordings
+from skills.library.recordings import content_cache, recordings
+from skills.library.recordings.content_cache import alike, entry_of, put_entry
 from skills.library.recordings.demos import add_demo
-from skills.library.recordings.recordings import alike, entry_of, put_entry, store_recording, stored_recording
+from skills.library.recordings.recordings import store_recording, stored_recording
 from skills.schemas.demos import DemoIn
-from skills.schemas.recordings import Reading
+from skills.schemas.recordings import TableIn
 from skills.schemas.scores import ScoreIn
 from skills.seeds.recordings import sample_recordings
 from tests.by_day import some
@@ -58,7 +59,7 @@ def counting(into: list[ParsedContent]) -> Callable[..., ParsedContent]:
 
 def add(database: Database, data: bytes = TABLE, **reading: Any) -> str:
     upload = cases.upload(data, media_type_of(io.BytesIO(data)), vouched=True)
-    return store_recording(database, upload.read_as(Reading(**reading).said), "test")[0].sha256
+    return store_recording(database, upload.read_as(TableIn(**reading)), "test")[0].sha256
 
 
 def forget(database: Database) -> None:
@@ -82,7 +83,7 @@ def faults(database: Database, **how: Any) -> list[tuple[str, str]]:
 
 def test_cutting_scoring_and_the_page_do_not_decode_a_stored_recording(database: Database):
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": {"uses": ["atlas"], "until": None}}, "test")
+        cases.agree(session, {"uses": ["atlas"], "until": None})
     sha256 = add(database)
     asked = ScoreIn(surgeon="kestrel", suture=cases.SUTURE, recording=sha256, start_s=0.0, end_s=0.9)
 
@@ -115,10 +116,9 @@ def test_the_cached_content_is_the_decoded_one_to_the_last_bit(database: Databas
     sha256 = add(database, data, **reading)
     with database.reading() as session:
         stored = recordings.find_recording(session, sha256)
-    decoded = parse_recording(io.BytesIO(data), **stored.reading)
+    decoded = parse_recording(io.BytesIO(data), **stored.reading.options)
     assert same(decoded, stored_recording(database, sha256, never))
-    assert stored.format == decoded.recording.format  # the detected format has been a column from the first version on
-    assert recordings.recording_json(stored)["format"] == stored.format
+    assert recordings.describe_recording(stored).format == stored.format == decoded.recording.format
 
 
 def test_a_recording_of_an_older_version_is_cached_at_its_first_use(database: Database):
@@ -134,7 +134,7 @@ def test_a_recording_of_an_older_version_is_cached_at_its_first_use(database: Da
 
 
 def test_a_large_content_is_stored_in_chunks(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(recordings, "CHUNK_BYTES", 1000)
+    monkeypatch.setattr(content_cache, "CHUNK_BYTES", 1000)
     data = sample_recordings()[0].data
     sha256 = add(database, data)
     assert counted(database)[1] > 50
@@ -183,11 +183,11 @@ def test_a_damaged_entry_is_logged_and_found_by_verify(database: Database, caplo
     ((where, why),) = faults(database)
     assert where == "parsed_recordings 1" and why.startswith("The entry does not match its digest")
     caplog.clear()
-    recordings.log.disabled = False  # import-linter, in another test, disables all loggers
+    content_cache.log.disabled = False  # import-linter, in another test, disables all loggers
     stored_recording(database, sha256)
-    assert [record.getMessage().split(":")[0] for record in caplog.records if record.name == recordings.log.name] == [
-        "parsed_recordings 1"
-    ]
+    assert [
+        record.getMessage().split(":")[0] for record in caplog.records if record.name == content_cache.log.name
+    ] == ["parsed_recordings 1"]
     assert sha256 not in caplog.text
 
 
@@ -231,7 +231,8 @@ def replace_entry(database: Database, sha256: str, told: ParsedContent) -> None:
     """Store a content with its correct digest, as somebody with write access who knows the format would."""
     with database.writing() as session:
         stored = recordings.find_recording(session, sha256)
-        put_entry(session, stored.row, recordings.packed_content(stored.sha256, 1 << 20, stored.reading, told))
+        source = SimpleNamespace(sha256=stored.sha256, size_bytes=1 << 20, reading=stored.reading)
+        put_entry(session, stored.row, entry_of(source, told))
 
 
 def test_verify_compares_the_newest_content_or_all_with_the_bytes(database: Database):
@@ -263,8 +264,8 @@ def test_contents_are_alike_within_rounding_and_in_nothing_else():
 
 
 def test_a_content_much_larger_than_its_file_is_not_kept(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(recordings, "LEAST_BYTES", 0)
-    monkeypatch.setattr(recordings, "MOST_SHARE", 0.1)
+    monkeypatch.setattr(content_cache, "LEAST_BYTES", 0)
+    monkeypatch.setattr(content_cache, "MOST_SHARE", 0.1)
     sha256, decoded = add(database), []
     for _ in range(2):
         stored_recording(database, sha256, counting(decoded))
@@ -348,7 +349,7 @@ def test_erasing_a_surgeon_keeps_anothers_episode_of_one_dataset(database: Datab
         for surgeon, number in (("kestrel", 0), ("heron", 1)):
             out = io.BytesIO()
             cut_episode(dataset, episodes_of(dataset)[number], out)
-            upload = cases.upload(out.getvalue(), media_type_of(out)).read_as(Reading(frame="base").said)
+            upload = cases.upload(out.getvalue(), media_type_of(out)).read_as(TableIn(frame="base"))
             episodes[surgeon] = store_recording(database, upload, "test", surgeon=surgeon)[0].sha256
             cut = DemoIn(surgeon=surgeon, suture=cases.SUTURE, segment="whole", arm="PSM1", grid="fit")
             add_demo(database, episodes[surgeon], cut, "test", never)

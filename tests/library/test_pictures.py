@@ -24,7 +24,7 @@ from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
 from tests.planning.motions import hand_off, ideal_playback
-from tests.planning.test_transfers import BESIDE
+from tests.planning.test_trajectory import BESIDE
 
 REPORT = {
     "failure": None,
@@ -113,10 +113,10 @@ def test_nobody_asked_for_pictures_of_older_playbacks(database: Database, playba
 def test_a_film_that_fails_fails_the_job_and_nothing_is_stored(
     database: Database, playback: StoredPlayback, monkeypatch: pytest.MonkeyPatch
 ):
-    def shoot(*_: Any, **__: Any) -> None:
+    def make_film(*_: Any, **__: Any) -> None:
         raise SimulationFailed("The simulator hung; play fewer passes.", cause="hung")
 
-    monkeypatch.setattr(film, "shoot", shoot)
+    monkeypatch.setattr(film, "make_film", make_film)
     [job] = asked(database)
     ended = cases.work(database, job)
     assert (ended.state, ended.error) == ("failed", "The simulator hung; play fewer passes.")

@@ -9,8 +9,8 @@ import pytest
 from skills.library.plans.plans import hands_over, plan_in_words
 from skills.library.plans.playbacks import CHECK_VERSION, costs_most, headline
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
-from skills.verification.monte_carlo import doubt
-from skills.verification.probabilities import JUDGE_VERSION, DoubtSettings
+from skills.verification.monte_carlo import estimate_success
+from skills.verification.probabilities import JUDGE_VERSION, EstimateSettings
 from tests.verification.test_monte_carlo import PAD_TOP_MM, motion
 from tests.verification.test_monte_carlo import PSM_M as OTHER_ARM
 
@@ -117,8 +117,8 @@ def test_nothing_else_is_good(of, lower, count, feasible, level, word):
     ],
 )
 def test_odds_count_what_was_judged_and_name_what_was_not(trajectory, pad_top_mm, counts, left_out):
-    settings = DoubtSettings(variations=20)
-    found = doubt(
+    settings = EstimateSettings(variations=20)
+    found = estimate_success(
         trajectory, approach_m=OTHER_ARM.approach, pad_top_mm=pad_top_mm, errors=UNCALIBRATED, settings=settings
     )
     report = NOW | {"feasible": True, "doubt": json.loads(json.dumps(asdict(found)))}

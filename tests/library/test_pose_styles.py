@@ -20,13 +20,14 @@ from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import HISTORY, inspect_installation
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo
+from skills.library.people.surgeons import put_surgeon
 from skills.library.policies import training
 from skills.library.policies.batches import retrain_part
 from skills.library.policies.versions import poses_of
 from skills.library.recordings.demos import withdraw_demo
 from skills.remedies import Remedy
+from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
@@ -271,7 +272,7 @@ def test_no_recording_is_read_without_consent(database: Database, monkeypatch: p
     add_both(database)
     job = cases.ask_training(database)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
     monkeypatch.setattr(training, "stored_recording", lambda *_: pytest.fail("it was read"))
     ended = cases.work(database, job)
     assert ended.state == "failed" and "consent" in (ended.error or "")

@@ -10,6 +10,7 @@ from sqlalchemy import func, select, text
 from skills.db.models import ProposalMark
 from skills.db.row_visibility import Only
 from skills.db.session import Database
+from skills.demonstration.segments import Segment
 from skills.errors import Conflict, NotFound
 from skills.formats.parsed import parse_recording
 from skills.library.people.erasure import delete_recording, erase_surgeon
@@ -62,7 +63,7 @@ def mark(database: Database, recording: str, number: int, state: str, note: str 
 
 
 def cut(database: Database, one: Proposal, surgeon: str = "kestrel", late_s: float = 0.0) -> str:
-    part = {"arm": one.segment["arm"], "start_s": one.segment["start_s"] + late_s, "end_s": one.segment["end_s"]}
+    part = {"arm": one.segment.arm, "start_s": one.segment.start_s + late_s, "end_s": one.segment.end_s}
     return cases.store(database, cases.upload(FIVE.data, MCAP), surgeon, **part).sha256
 
 
@@ -160,4 +161,4 @@ def test_the_same_hand_off_is_half_of_the_longer_of_two(at: tuple[int, int, int,
 
     if one and other:
         expected = 2 * len(one & other) >= max(len(one), len(other))
-        assert proposals._same({"start_s": start, "end_s": end}, Cut()) == expected
+        assert proposals._same(Segment("PSM2", start, end, end, "motion", ()), Cut()) == expected

@@ -5,24 +5,25 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from skills.library.whose import recognise_recording
 from sqlalchemy.orm import Session
 
 from skills.db.session import Database
 from skills.errors import Conflict
 from skills.formats import write_mcap
 from skills.formats.parsed import parse_recording
+from skills.library.comparison.recognition import recognise_recording
 from skills.library.comparison.scores import score
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import erasures_of
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.recordings.datasets import request_dataset
 from skills.library.recordings.demos import exported_chunk, exported_recording, find_demo, shown_demo
 from skills.library.recordings.proposals import find_proposal
 from skills.library.recordings.recordings import store_recording
 from skills.library.recordings.timelines import Source, check_export, timeline_of
 from skills.schemas.datasets import DatasetIn
+from skills.schemas.people import SurgeonIn
 from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.comparison.cohort import cohort
@@ -36,7 +37,7 @@ FIRST, SECOND = {"start_s": 0.0, "end_s": PASS_S - 0.02}, {"start_s": PASS_S, "e
 
 def agree(database: Database, surgeon: str, to: Any) -> None:
     with database.writing() as session:
-        put_surgeon(session, surgeon, {"consent": to}, "anna")
+        put_surgeon(session, surgeon, SurgeonIn.model_validate({"consent": to}), "anna")
 
 
 def doors(database: Database, demo: str) -> dict[str, bool]:

@@ -24,7 +24,6 @@ from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation import inspection
 from skills.library.operation.inspection import Checked, inspect_policies
 from skills.library.operation.integrity import demo_identity, policy_identity, poses_identity_of
-from skills.library.people.catalogue import put_surgeon
 from skills.library.policies.relearning import compute_again, decoded
 from skills.library.policies.training import GATE_VERSION, certified, lessons
 from skills.library.recordings.demos import mark_demo
@@ -241,7 +240,7 @@ def test_what_was_erased_meanwhile_is_not_called_wrong(database, monkeypatch):
 
 def test_without_consent_nothing_is_learnt_again(database):
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": {"uses": []}}, "test")
+        cases.agree(session, {"uses": []})
     part = parts(database)[RELEARNT]
     assert part.wrong == []
     assert len(part.left_out) == 6

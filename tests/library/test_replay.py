@@ -18,7 +18,7 @@ from skills.errors import BadPlan, Conflict, Corrupt, NotFound
 from skills.formats.replay_bag import arms_of
 from skills.formats.verify import check_bag
 from skills.library.operation.history import newest_checkpoint, sign_history
-from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.people.surgeons import find_surgeon
 from skills.library.plans import replay
 from skills.library.plans.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
 from skills.library.plans.playbacks import CHECK_VERSION
@@ -187,11 +187,11 @@ def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: P
         ({"uses": ["training", "export"], "until": "2001-01-01"}, "expired on 2001-01-01"),
     ):
         with database.writing() as session:
-            put_surgeon(session, "kestrel", {"consent": consent}, "test")
+            cases.agree(session, consent)
         with pytest.raises(Conflict, match=words):
             gate(database, plan)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": {"uses": ["training", "export"]}}, "test")
+        cases.agree(session, {"uses": ["training", "export"]})
         with pytest.raises(Conflict, match="none is released"):  # because consent to training had ended
             cleared(session, find_plan(session, plan.sha256), **OF_A1_ALONE)
         releases.release(session, find_version(session, "kestrel", cases.SUTURE, 1), "test")
@@ -210,7 +210,7 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
 
     def withdrawn(members: dict[str, bytes]) -> bytes:
         with database.writing() as session:
-            put_surgeon(session, "kestrel", {"consent": {"uses": ["training"], "until": None}}, "test")
+            cases.agree(session, {"uses": ["training"], "until": None})
         return composed(members)
 
     assert replay_bag(database, plan.sha256, **OF_A1_ALONE)

@@ -19,13 +19,14 @@ from skills.errors import BadSettings, Corrupt, NotFound
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import keep_erasures, read_erasures
 from skills.library.operation.inspection import inspect_installation
-from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.people.keys import create_key, revoke_key
+from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import release, withdraw
 from skills.library.policies.versions import policy_of
 from skills.library.recordings.demos import mark_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
+from skills.schemas.people import Consent, SurgeonIn
 from skills.serving import keeping_erasures
 from skills.settings import Settings
 from tests import backends
@@ -125,16 +126,16 @@ def test_what_ended_and_was_allowed_again_before_the_backup_stands(
     policy = cases.train(database, release=True)
     with database.writing() as session:
         withdraw(session, find_surgeon(session, "kestrel"), cases.SUTURE, "test")
-        put_surgeon(session, "kestrel", {"consent": {"uses": ["training"], "until": None}}, "test")
+        cases.agree(session, {"uses": ["training"], "until": None})
     keep_erasures(database, tmp_path / "list.json")
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": BOTH}, "test")
+        cases.agree(session, BOTH)
         release(session, session.get_one(PolicyVersion, policy.row), "test")
     back_up(database, tmp_path / "b.zip")
     after = restored()
     assert served(after) == policy.sha256
     with after.reading() as session:
-        assert find_surgeon(session, "kestrel").consent == BOTH
+        assert find_surgeon(session, "kestrel").consent == Consent.model_validate(BOTH)
     with database.writing() as session:
         erase_demo(session, demo, "test")
     again = restored()
@@ -203,20 +204,20 @@ def test_a_consent_that_was_narrowed_stays_narrow_and_none_is_widened(
     before: Any, after: Any, left: Any, database: Database, restored: Callable[[], Database], tmp_path: Path
 ):
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": before, "protocol": "IRB 1"}, "test")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate({"consent": before, "protocol": "IRB 1"}), "test")
     back_up(database, tmp_path / "b.zip")
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": after}, "test")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate({"consent": after, "protocol": "IRB 1"}), "test")
     with restored().reading() as session:
         surgeon = find_surgeon(session, "kestrel")
-        assert (surgeon.consent, surgeon.protocol) == (left, "IRB 1")
+        assert (surgeon.consent, surgeon.protocol) == (Consent.model_validate(left), "IRB 1")
 
 
 def test_the_list_names_nobody_and_another_format_is_refused(database: Database, tmp_path: Path):
     demo = cases.add_demo(database).sha256
     with database.writing() as session:
-        put_surgeon(session, "canary-7f3a91", {"consent": BOTH}, "test")
-        put_surgeon(session, "canary-77", {}, "test")
+        cases.agree(session, BOTH, "canary-7f3a91")
+        put_surgeon(session, "canary-77", SurgeonIn(), "test")
         erase_surgeon(session, "canary-77", "test")
         erase_demo(session, demo, "test")
     listed = keep_erasures(database, tmp_path / "list.json")
@@ -261,7 +262,7 @@ def test_what_ended_again_while_the_clock_was_wrong_ends_again(
 
     def end() -> None:
         with database.writing() as session:
-            put_surgeon(session, surgeon, {"consent": {"uses": ["training"], "until": None}}, "test")
+            cases.agree(session, {"uses": ["training"], "until": None}, surgeon)
             erase_demo(session, second, "test")
             mark_demo(session, first, "failure", None, "test")
 
@@ -270,14 +271,14 @@ def test_what_ended_again_while_the_clock_was_wrong_ends_again(
         end()
         with database.writing() as session:
             mark_demo(session, first, "success", None, "test")
-            put_surgeon(session, surgeon, {"consent": BOTH}, "test")
+            cases.agree(session, BOTH, surgeon)
     cases.add_demo(database, cases.hand_off((1.0, 0.0, 0.0)))
     back_up(database, tmp_path / "b.zip")
     end()
     after = restored()
     with after.reading() as session:
         assert [(one.sha256, one.outcome) for one in session.scalars(select(Demonstration))] == [(first, "failure")]
-        assert find_surgeon(session, surgeon).consent["uses"] == ["training"]
+        assert find_surgeon(session, surgeon).consent == Consent(uses=["training"])
 
 
 def test_a_release_superseded_while_the_clock_was_wrong_stays_superseded(

@@ -14,12 +14,13 @@ from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.q_learning import CellQLearning
 from skills.library.operation import jobs
 from skills.library.operation.jobs import BATCH
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.policies import batches, retraining
 from skills.library.policies.batches import compare
 from skills.library.policies.training import learn_style
 from skills.library.recordings.demos import withdraw_demo
+from skills.schemas.people import SurgeonIn
 from skills.schemas.training import FitOnTheSame, PolicyFigures
 from tests.library import cases
 from tests.library.styles import (
@@ -86,7 +87,7 @@ def test_equal_requests_for_the_same_styles_are_one_job_until_one_fails(database
     more = ask_retraining(database)
     assert (more.row != job.row, more.request["styles"]) == (True, 4)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
     for part in parts_of(database, more):
         cases.work(database, part)
     assert look(database, more).state == "failed"

@@ -12,11 +12,12 @@ from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.parsed import parse_recording
 from skills.library.comparison.calibrations import keep
 from skills.library.comparison.scores import LEAST_DEMOS, progress, score
-from skills.library.people.catalogue import put_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.recordings.demos import mark_demo, upload_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
 from skills.packing import canonical, sha256
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from skills.schemas.scores import Score, ScoreIn
 from skills.scoring.calibration import SkillModel, as_numbers
 from tests.library import cases, rated
@@ -31,7 +32,7 @@ READ = parse_recording
 
 def put(database: Database, slug: str, **about: object) -> None:
     with database.writing() as session:
-        put_surgeon(session, slug, {"skill_level": None, "consent": None} | about, "test")
+        put_surgeon(session, slug, SurgeonIn.model_validate({"skill_level": None, "consent": None} | about), "test")
 
 
 def bent(way_mm: float, surgeon: str, database: Database, samples: int = 20) -> Demonstration:
@@ -69,7 +70,7 @@ def test_figures_and_deviation_are_those_of_the_two_motions(database: Database) 
     told = scored(database, bent(6.0, "plover", database, samples=40))
     figures = {one.name: one for one in told.figures}
     assert figures["duration_s"].ratio == pytest.approx(119 / 59, rel=0.01)
-    assert figures["path_length_mm"].reference == pytest.approx(reference.report["path_length_mm"])
+    assert figures["path_length_mm"].reference == pytest.approx(reference.report.path_length_mm)
     assert told.deviation.total_mm > 100 and len(told.deviation.path_mm) == 100
     assert np.sum(told.deviation.shares) == pytest.approx(1.0)
     assert told.as_recorded.total_mm > 100

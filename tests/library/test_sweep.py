@@ -30,7 +30,7 @@ from skills.library.operation.sweep import STEADY_S, SteadyClock, drop_contents,
 from skills.library.people.erasure import delete_recording, erase_surgeon
 from skills.library.plans.plans import planned, trajectory_of
 from skills.library.policies import retraining
-from skills.library.recordings import recordings
+from skills.library.recordings import content_cache, recordings
 from skills.library.recordings.recordings import find_recording, recording_bytes, store_recording, stored_recording
 from skills.settings import Settings
 from skills.verification.playback import Pictures
@@ -46,7 +46,7 @@ KIB = 1 << 10
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pieces of 1 KiB, so that a recording of 3 kB has several, and three jobs in a step."""
-    for room in (recordings, sweep):
+    for room in (recordings, content_cache, sweep):
         monkeypatch.setattr(room, "CHUNK_BYTES", KIB)
         monkeypatch.setattr(room, "AT_ONCE_BYTES", KIB)
     monkeypatch.setattr("skills.library.people.erasure.AT_ONCE_BYTES", KIB)
@@ -139,13 +139,13 @@ def test_a_content_half_cached_is_not_used_and_is_completed(
     stored, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
     told = stored_recording(database, stored.sha256)
     with database.writing() as session:
-        session.execute(update(ParsedRecording).values(version=recordings.UNFINISHED))
+        session.execute(update(ParsedRecording).values(version=content_cache.UNFINISHED))
         session.execute(text("DELETE FROM parsed_chunks WHERE number = 1"))
     chunks = count(database, ParsedChunk)
-    assert recordings.alike(stored_recording(database, stored.sha256), told)
+    assert content_cache.alike(stored_recording(database, stored.sha256), told)
     assert count(database, ParsedChunk) == chunks + 1
     with database.reading() as session:
-        assert recordings.cached_content(session, find_recording(session, stored.sha256)) is not None
+        assert content_cache.cached_content(session, find_recording(session, stored.sha256)) is not None
 
 
 def test_a_deleted_recording_is_gone_at_once_and_swept_later(database: Database, small: None):
@@ -344,13 +344,13 @@ def test_a_small_upload_needs_one_transaction(database: Database, monkeypatch: p
 def test_bytes_sent_twice_at_once_are_kept_once(database: Database, small: None):
     data = cases.hand_off()
     first, second = cases.upload(data), cases.upload(data)
-    told = recordings.tell_upload(first)
+    told = recordings.parse_upload(first)
     ahead = [recordings.send_ahead(database, one) for one in (first, second)]
     assert None not in ahead and len(set(ahead)) == 2
     kept = []
     for upload, row in zip((first, second), ahead, strict=True):
         with database.writing() as session:
-            kept.append(recordings.keep(session, upload, told, None, "test", row)[0].row)
+            kept.append(recordings.put_recording(session, upload, told, None, "test", row)[0].row)
     assert kept == [ahead[0], ahead[0]]
     sweep_erased(database)
     with database.reading() as session:

@@ -21,13 +21,14 @@ from skills.formats import read_recording, write_mcap
 from skills.gridworld.grid import GridWorld, choose_grid
 from skills.jobs.workflows import Work
 from skills.library.operation import jobs
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job
 from skills.library.plans.tries import CELLS_MM, choose_cells, request_try
 from skills.library.recordings.demos import add_demo
 from skills.library.recordings.recordings import store_recording
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from skills.schemas.tries import LOSS_MM, TryIn
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
@@ -202,7 +203,7 @@ def test_a_cancelled_try_stops_at_its_next_step(database: Database) -> None:
 def test_what_is_not_there_or_not_consented_is_refused_at_once(database: Database) -> None:
     recording = stored(database)
     with database.writing() as session:
-        put_surgeon(session, "heron", {"consent": {"uses": ["export"]}}, "test")
+        cases.agree(session, {"uses": ["export"]}, "heron")
     for surgeon, known, error in (
         ("nobody", recording, NotFound),
         ("kestrel", "0" * 64, NotFound),
@@ -240,7 +241,12 @@ def start_it_over(session: Session, job: Job) -> None:
 
 
 def allow_nothing(session: Session, job: Job) -> None:
-    put_surgeon(session, session.get_one(Surgeon, job.surgeon_row).slug, {"consent": {"uses": []}}, "test")
+    put_surgeon(
+        session,
+        session.get_one(Surgeon, job.surgeon_row).slug,
+        SurgeonIn.model_validate({"consent": {"uses": []}}),
+        "test",
+    )
 
 
 STORED = (Demonstration, ParsedRecording, PolicyVersion, Release, Plan, StoredPlayback, Event)

@@ -95,7 +95,7 @@ class Compared(RuleBasedStateMachine):
 
     def _check_library(self, stored: dict[str, Any]) -> None:
         model = self.model
-        assert {one.slug: one.consent for one in stored["surgeons"]} == {
+        assert {one.slug: one.consent and one.consent.model_dump(mode="json") for one in stored["surgeons"]} == {
             surgeon: consent.written for surgeon, consent in model.surgeons.items()
         }
         assert {one.sha256 for one in stored["recordings"]} == set(model.recordings)

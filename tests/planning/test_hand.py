@@ -25,8 +25,8 @@ from skills.planning.path_fit import TREMOR_S, Hand, fit_to_demo, hand_along, st
 from skills.planning.plan import SuturePoint, departure_of, driven_pass, stack
 from skills.planning.trajectory import A1, A2, Trajectory, time_parametrise
 from skills.verification.clearance import openings
-from skills.verification.monte_carlo import doubt
-from skills.verification.probabilities import DoubtSettings
+from skills.verification.monte_carlo import estimate_success
+from skills.verification.probabilities import EstimateSettings
 from tests.planning.test_path_fit import shipped
 
 TURN_RAD = np.radians(60)
@@ -298,8 +298,8 @@ def test_a_hand_off_that_was_not_recorded_is_the_papers():
 
 def test_the_estimate_of_success_judges_the_recorded_hand_off():
     motion, _ = at_home(psm_m=recorded_psm_m())
-    few = DoubtSettings(variations=20)
-    found = doubt(motion, approach_m=None, pad_top_mm=-170.0, settings=few)
+    few = EstimateSettings(variations=20)
+    found = estimate_success(motion, approach_m=None, pad_top_mm=-170.0, settings=few)
     assert found.hand_offs == 1
     assert found.under[0].passes[0].caught is not None
     assert openings(motion.arms[0]).max() == pytest.approx(0.2)  # half of the jaw's 0.4 rad

@@ -1,4 +1,4 @@
-"""Simulators with one fault each, to be named to `play` or `shoot` in place of the real one."""
+"""Simulators with one fault each, to be named to `play` or `make_film` in place of the real one."""
 
 from collections.abc import Callable
 from dataclasses import make_dataclass

@@ -46,7 +46,7 @@ def shown() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def shot() -> film.Film:
-    return film.shoot(both_arms(), pad_top_mm=PAD_TOP_MM, samples=shown())
+    return film.make_film(both_arms(), pad_top_mm=PAD_TOP_MM, samples=shown())
 
 
 def frames_of(mp4: bytes) -> np.ndarray:
@@ -112,19 +112,22 @@ def test_a_browser_can_play_it_from_its_beginning(shot):
 
 @needs_simulator
 def test_the_same_trajectory_gives_the_same_bytes(shot):
-    assert film.shoot(both_arms(), pad_top_mm=PAD_TOP_MM, samples=shown()) == shot
+    assert film.make_film(both_arms(), pad_top_mm=PAD_TOP_MM, samples=shown()) == shot
 
 
 @needs_simulator
 def test_an_arm_alone_is_filmed_too():
-    assert len(frames_of(film.shoot(one_pass(), pad_top_mm=PAD_TOP_MM, samples=[0, 9]).mp4)) == 2 + film.HELD_FRAMES - 1
+    assert (
+        len(frames_of(film.make_film(one_pass(), pad_top_mm=PAD_TOP_MM, samples=[0, 9]).mp4))
+        == 2 + film.HELD_FRAMES - 1
+    )
 
 
 @needs_simulator
 def test_a_pass_of_a2_alone_is_filmed_too():
     a2 = PassPath(hand_off().tip_mm[-1:], POINTING_DOWN, hand_off().target_rotation)
     turning = time_parametrise([a2], rate_hz=60.0)
-    assert film.shoot(turning, pad_top_mm=PAD_TOP_MM, samples=[0, len(turning) - 1]).gif.startswith(b"GIF89a")
+    assert film.make_film(turning, pad_top_mm=PAD_TOP_MM, samples=[0, len(turning) - 1]).gif.startswith(b"GIF89a")
 
 
 # ---- the choice of samples -------------------------------------------------------------------------------------
@@ -203,5 +206,5 @@ def test_the_needle_goes_with_the_arm_that_holds_it():
 )
 def test_a_crew_that_makes_no_film_is_refused(crew: str, cause: str):
     with pytest.raises(SimulationFailed) as caught:
-        film.shoot(small_trajectory(rate_hz=60.0), pad_top_mm=PAD_TOP_MM, target=f"tests.simulation.faults:{crew}")
+        film.make_film(small_trajectory(rate_hz=60.0), pad_top_mm=PAD_TOP_MM, target=f"tests.simulation.faults:{crew}")
     assert caught.value.numbers["cause"] == cause

@@ -15,7 +15,7 @@ from skills.db.models import Plan, StoredPlayback
 from skills.db.session import Database
 from skills.errors import BadPlan, SimulationFailed, Unreachable
 from skills.kinematics import POINTING_DOWN, forward, inverse, matrix_of, quaternion_of
-from skills.library.people.catalogue import find_surgeon
+from skills.library.people.surgeons import find_surgeon
 from skills.library.plans.playbacks import find_playback, request_playback, standing_of
 from skills.library.policies import releases
 from skills.library.recordings.demos import upload_demo
@@ -24,7 +24,7 @@ from skills.planning import handoff
 from skills.planning.handoff import OtherArm
 from skills.planning.trajectory import A1, PassPath, Trajectory, time_parametrise
 from skills.schemas.demos import DemoIn
-from skills.schemas.recordings import Reading
+from skills.schemas.recordings import TableIn
 from skills.settings import Settings
 from skills.simulation.player import play
 from skills.verification.deviations import LIMITS
@@ -246,7 +246,7 @@ def test_a_plan_in_another_frame_than_the_arms_base_is_refused(databases):
     database, _ = databases
     upload_demo(
         database,
-        cases.upload(cases.hand_off((5.0, 0.0, 0.0)), reading=Reading(frame="ECM").said),
+        cases.upload(cases.hand_off((5.0, 0.0, 0.0)), reading=TableIn(frame="ECM")),
         DemoIn(surgeon="kestrel", suture=cases.SUTURE),
         "test",
     )

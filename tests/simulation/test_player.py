@@ -22,7 +22,7 @@ from tests.bench.playing import stacked
 from tests.by_day import some
 from tests.planning.motions import hand_off, small_trajectory
 from tests.planning.test_hand import at_home, recorded_psm_m, turning
-from tests.planning.test_transfers import BESIDE
+from tests.planning.test_trajectory import BESIDE
 
 needs_simulator = pytest.mark.needs("simulator")
 TRAJECTORY = small_trajectory(passes=2, rate_hz=60.0)

@@ -13,14 +13,13 @@ from skills.simulation import referee as refereeing
 from skills.simulation.referee import Physics, Refereed, referee
 from skills.verification.clearance import RADIUS_MM, needle_poses, psm_m_poses
 from skills.verification.error_draws import draw, rotation_of
-from skills.verification.probabilities import DoubtSettings
+from skills.verification.probabilities import EstimateSettings
 from tests.arms import ARMS, EXACT
 from tests.needs import need
-from tests.verification.test_monte_carlo import ALONE, BESIDE, PSM_M, motion, only
-from tests.verification.test_worlds import some_plan
+from tests.verification.test_monte_carlo import ALONE, BESIDE, PSM_M, motion, only, some_plan
 
 ONE = motion(1, PSM_M)
-NO_DOUBT = DoubtSettings(variations=1, suture_point_mm=0.0, needle_rad=0.0)
+NO_DOUBT = EstimateSettings(variations=1, suture_point_mm=0.0, needle_rad=0.0)
 
 
 def exactly(trajectory=ONE, **given) -> Refereed:
@@ -210,7 +209,7 @@ def refereed(plans: tuple[int, ...], trials: int, varied: int = 0) -> list[Refer
     """Referee the first plans of each band, in the order of their seeds; each tenth also with other physics."""
     need("mujoco")
     found: list[Refereed] = []
-    left, seed, settings = list(plans), 0, DoubtSettings(variations=4000)
+    left, seed, settings = list(plans), 0, EstimateSettings(variations=4000)
     while any(left):
         trajectory, errors, _ = some_plan(seed)
         band = int(np.searchsorted(BANDS, caught_at(trajectory, errors, settings), side="right")) - 1
@@ -223,7 +222,7 @@ def refereed(plans: tuple[int, ...], trials: int, varied: int = 0) -> list[Refer
     return found
 
 
-def caught_at(trajectory, errors, settings: DoubtSettings) -> float:
+def caught_at(trajectory, errors, settings: EstimateSettings) -> float:
     drawn = draw(0, 0, settings.variations, 1, suture_point_mm=5.0, needle_rad=settings.needle_rad)
     displaced = drawn.under(errors, trajectory.stamps_s[trajectory.last_samples])
     return float(refereeing._closed_form(trajectory, 0, drawn, displaced, settings).mean())

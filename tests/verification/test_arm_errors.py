@@ -114,7 +114,7 @@ def test_the_stated_errors_are_those_that_were_put_in():
     left = set(SIZES) - {"tip_noise_mm", "tip_correlation_s"}
     assert all(getattr(found.errors, size) == getattr(UNCALIBRATED, size) for size in left)
     assert all(found.errors.sources[size].startswith("Not measured by this recording") for size in left)
-    assert "of the encoders and not of the tip" in found.in_words
+    assert "of the encoders and not of the tip" in found.describe()
 
 
 def test_bands_hold_as_many_of_the_samples_left_out_as_they_say():

@@ -38,7 +38,7 @@ def test_a_tenth_of_the_samples_elsewhere_is_a_slip_of_27_in_260():
     found = measure_slip(arm(errors), CELL_MM)
     assert (found.elsewhere, found.slip) == (pytest.approx(0.1), pytest.approx(2.7 / 26))
     assert found.interval[0] < found.slip < found.interval[1] and found.tip_elsewhere is None
-    assert "at 10.0% of 500 samples" in found.in_words and "The tip was not tracked" in found.in_words
+    assert "at 10.0% of 500 samples" in found.describe() and "The tip was not tracked" in found.describe()
 
 
 def test_an_arm_sent_to_centres_of_a_grid_is_in_as_many_other_cells():
@@ -63,7 +63,7 @@ def test_the_tip_is_counted_beside_the_encoders_where_it_is_tracked():
     rng = np.random.default_rng(4)
     found = measure_slip(arm(normal(rng, 500, 0.1), normal(rng, 500, 0.8)), CELL_MM)
     assert found.slip == 0.0 and found.tip_elsewhere is not None and 0.3 < found.tip_elsewhere < 0.7
-    assert "for the scene's margin" in found.in_words
+    assert "for the scene's margin" in found.describe()
 
 
 def test_too_few_samples_or_too_small_cells_are_refused():

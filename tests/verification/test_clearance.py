@@ -1,35 +1,58 @@
-"""Distances of capsules in closed form: against cases worked by hand, sampled points, the URDF and the simulator."""
+"""Clearances between surfaces and their bounds, the needle, and its catch, against second methods and by hand."""
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from importlib.resources import as_file, files
+from math import erf, radians, sqrt
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as some
 
 from skills.kinematics import (
     CANNULA_MM,
     CLASSIC,
     JAW_TIP_MM,
+    POINTING_DOWN,
     WRIST_MM,
     forward,
     instrument_of,
     inverse,
     matrix_of,
+    quaternion_of,
     reachable,
 )
-from skills.planning.handoff import HOLDING_RAD
+from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_RADIUS_MM, hand_off, realign
+from skills.planning.trajectory import TRANSFER, PassPath, time_parametrise
+from skills.verification.arm_errors import MEAN_LENGTH
 from skills.verification.clearance import (
     ASIDE_MM,
     FINGER_MM,
+    FINGER_RADIUS_MM,
     FINGERS,
     LINKS,
+    NEEDLE_FREE_RAD,
+    NEEDLE_THICK_MM,
     RADII_MM,
+    WRIST_RADIUS_MM,
+    Bounds,
+    HandOff,
     Links,
+    catch,
     clearance_between,
     clearance_to_pad,
     links_of,
+    needle_poses,
+    needle_to_pad_mm,
+    travel_mm,
 )
+from skills.verification.error_draws import Drawn, draw
+from skills.verification.playback import link_pairs
+from tests.bench.playing import stacked
 from tests.needs import need
+from tests.planning.motions import small_trajectory
 
 STRAIGHT = np.array([[0.0, 0.0, 150.0, 0.0, 0.0, 0.0]])
 BESIDE_MM = np.array([20.0, 0.0, 0.0])
@@ -218,3 +241,230 @@ def test_two_arms_are_as_far_apart_as_the_simulator_says(bullet):
         m.pose(joints_m[k], opening_rad=0.5)
         theirs = [[a.apart_mm(m.number, link, m.links[other]) for other in LINKS] for link in LINKS]
         np.testing.assert_allclose(ours[k], theirs, atol=1e-6)  # mm
+
+
+APPROACH = (-0.94, 0.10, -0.33)
+OPENING_RAD = radians(30)
+
+
+def drawn_errors(seed: int, count: int, needle_rad: float) -> tuple[Drawn, np.ndarray]:
+    """Return draws, and offsets between the arms of the mean length of one arm's at a tip error of 1 mm."""
+    drawn = draw(seed, 0, count, 1, suture_point_mm=5.0, needle_rad=needle_rad)
+    return drawn, drawn.tip_bias[0] / MEAN_LENGTH
+
+
+def planned_hand_off() -> HandOff:
+    jaw = realign(POINTING_DOWN, APPROACH).rotation
+    tip = np.array([5.0, 55.0, -125.0])
+    (tip_m,), (jaw_m,) = hand_off(tip[None], jaw[None], APPROACH)
+    return HandOff(tip, jaw, tip_m, jaw_m)
+
+
+PLANNED = planned_hand_off()
+UNTURNED = np.eye(3)[None]
+
+
+def test_as_planned_the_needle_lies_along_the_hinge_between_the_fingers():
+    between, askew = catch(PLANNED, UNTURNED, np.zeros((1, 3)), OPENING_RAD)
+    assert between.tolist() == [True]
+    assert askew[0] < 1e-7
+
+
+def test_jaws_that_are_turned_over_catch_the_same():
+    drawn, offset = drawn_errors(0, 300, radians(10))
+    over = replace(PLANNED, jaw_m=PLANNED.jaw_m @ np.diag([-1.0, -1.0, 1.0]))
+    for one, other in zip(*(catch(at, drawn.turned, offset, OPENING_RAD) for at in (PLANNED, over)), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("aside_mm", "out_mm", "edge"),
+    [
+        # PSM_M holds the needle, 0.66 mm thick, 7 mm from its hinge. Along its approach it may sink in until the wrist,
+        # 3.6 mm from the hinge, and come out until the tips, 10.2 mm from it.
+        (0.0, 1.0, 10.2 - 7.0 - 0.33),
+        (0.0, -1.0, 7.0 - 3.6 - 0.33),
+        # Sideways, and half inwards, as far as the open finger allows: y cos 30 + 0.33 = z sin 30.
+        (1.0, 0.0, (3.5 - 0.33) / sqrt(0.75)),
+        (-1.0, 0.0, (3.5 - 0.33) / sqrt(0.75)),
+        (0.5, -sqrt(0.75), (3.5 - 0.33) / sqrt(0.75)),
+        (-0.5, -sqrt(0.75), (3.5 - 0.33) / sqrt(0.75)),
+        # Half outwards it is within the tips' path when they close, 9.87^2 = (7 + d cos 30)^2 + (d sin 30)^2.
+        (0.5, sqrt(0.75), sqrt(9.87**2 - 7.0**2 / 4) - 7.0 * sqrt(0.75)),
+        (-0.5, sqrt(0.75), sqrt(9.87**2 - 7.0**2 / 4) - 7.0 * sqrt(0.75)),
+    ],
+)
+def test_the_edges_of_what_the_fingers_sweep_are_worked_by_hand(aside_mm, out_mm, edge):
+    direction = PLANNED.jaw_m @ np.array([0.0, aside_mm, out_mm])
+    within, beyond = ((edge + by) * direction for by in (-1e-6, 1e-6))
+    between, _ = catch(PLANNED, np.repeat(UNTURNED, 2, axis=0), np.array([within, beyond]), OPENING_RAD)
+    assert between.tolist() == [True, False]
+
+
+def test_along_the_hinge_the_needle_slides_through_until_it_ends():
+    # Moved by d along the hinge, another place of the arc is between the fingers, where cos phi = -d / r.
+    n = PLANNED.jaw_m[:, 0]
+    shifts = np.array([1.0, -1.0, 3.0, -4.0, 4.0, 9.0])
+    between, askew = catch(PLANNED, np.repeat(UNTURNED, 6, axis=0), -shifts[:, None] * n, OPENING_RAD)
+    np.testing.assert_allclose(askew[:5], np.arcsin(np.abs(shifts[:5]) / NEEDLE_RADIUS_MM), atol=1e-9)
+    # Its free end is 120 degrees from PSM_A's grip: at 4 mm, 119 degrees, it is only half across the fingers.
+    assert between.tolist()[:5] == [True, True, True, True, False]
+    assert not between[5] and np.isnan(askew[5])  # the offset exceeds the radius: the needle does not pass at all
+
+
+def test_a_sampled_arc_crosses_the_jaws_at_the_same_place_and_angle():
+    drawn, offset = drawn_errors(3, 400, radians(25))
+    apart = 2.0 * offset
+    between, askew = catch(PLANNED, drawn.turned, apart, OPENING_RAD)
+    n, a, a_m = PLANNED.jaw_a[:, 0], PLANNED.jaw_a[:, 2], PLANNED.jaw_m[:, 2]
+    free = -n * np.sign(n @ a_m)
+    phi = np.linspace(0, NEEDLE_FREE_RAD, 24001)[:, None]
+    arc = NEEDLE_RADIUS_MM * ((1 - np.cos(phi)) * np.cross(a, free) + np.sin(phi) * free)
+    for k in range(400):
+        points = (PLANNED.tip_a + HELD_MM * a + apart[k] + arc @ drawn.turned[k].T - PLANNED.tip_m) @ PLANNED.jaw_m
+        # Of the two crossings a half circle may have, the one on its far side.
+        crossing = np.flatnonzero(np.diff(np.sign(points[:, 0])) > 0)
+        if not len(crossing):
+            assert not between[k]
+            continue
+        at = crossing[-1]
+        along = points[at + 1] - points[at]
+        cosine = np.clip(along[0] / np.linalg.norm(along), -1, 1)
+        assert askew[k] == pytest.approx(np.arccos(cosine), abs=2e-4)
+        y, z = abs(points[at, 1]), points[at, 2]
+        beside = NEEDLE_RADIUS_MM * min(phi[at, 0], NEEDLE_FREE_RAD - phi[at, 0]) - FINGER_RADIUS_MM
+        depth, half = np.hypot(y, z), NEEDLE_THICK_MM / 2
+        room = z * np.sin(OPENING_RAD) - y * np.cos(OPENING_RAD) - half
+        spare = min(beside, depth - WRIST_RADIUS_MM - half, JAW_TIP_MM - half - depth, room)
+        if abs(spare) > 0.01:
+            assert between[k] == (spare > 0)
+
+
+def test_the_angle_alone_fails_as_often_as_the_error_function_says():
+    # Without any turn, the tangent is off by asin(d / r) for an offset d along the hinge, a normal number.
+    drawn, offset = drawn_errors(1, 200_000, 0.0)
+    apart = 3.0 * (drawn.tip_bias[0] - drawn.tip_bias[1]) / MEAN_LENGTH
+    _, askew = catch(PLANNED, drawn.turned, apart, OPENING_RAD)
+    sigma = 3.0 / sqrt(8 / np.pi) * sqrt(2)  # the mean length of an offset is 3 mm, and there are two
+    share = np.count_nonzero(askew <= radians(15)) / 200_000
+    assert share == pytest.approx(erf(NEEDLE_RADIUS_MM * np.sin(radians(15)) / sigma / sqrt(2)), abs=0.004)
+    assert np.linalg.norm(3.0 * offset, axis=1).mean() == pytest.approx(3.0, abs=0.01)
+
+
+PAD_MM = np.array([0.0, 55.0, -150.0])
+LEVEL = time_parametrise([PassPath([[0, 55, -135], [0, 55, -130]], POINTING_DOWN)], rate_hz=60.0)
+
+
+def test_a_downward_needle_lies_level_9_mm_below_the_hinge():
+    found = needle_to_pad_mm(LEVEL, np.array([0, len(LEVEL) - 1]), PAD_MM)
+    np.testing.assert_allclose(found, [15.0 - 9.0 - 0.33, 20.0 - 9.0 - 0.33], atol=1e-9)
+
+
+@pytest.mark.parametrize(("centre", "lowest_mm"), [(1.0, 0.0), (-1.0, 1.5 * NEEDLE_RADIUS_MM)])
+def test_on_its_edge_it_reaches_down_as_far_as_its_arc_does(centre, lowest_mm):
+    """Held along x, the approach along -y, the arc's centre above or below; two thirds of it are on one side."""
+    upright = np.array([[centre, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, centre, 0.0]])
+    edge = replace(LEVEL, rotation_xyzw=np.tile(quaternion_of(upright[None]), (len(LEVEL), 1)))
+    [found] = needle_to_pad_mm(edge, np.array([0]), PAD_MM)
+    assert found == pytest.approx(15.0 - lowest_mm - 0.33, abs=1e-9)
+
+
+def test_inside_the_pad_it_is_negative():
+    level = time_parametrise([PassPath([[0, 55, -145], [0, 55, -140]], POINTING_DOWN)], rate_hz=60.0)
+    assert needle_to_pad_mm(level, np.array([0]), PAD_MM)[0] == pytest.approx(-4.0 - 0.33, abs=1e-9)
+
+
+def test_after_the_hand_off_the_needle_follows_psm_m_to_the_next_pass():
+    trajectory = stacked(passes=2, rate_hz=60.0)
+    end = int(trajectory.last_samples[0])
+    place, rotation = needle_poses(trajectory, np.arange(len(trajectory)))
+    away = np.flatnonzero((trajectory.phase == TRANSFER) & (trajectory.pass_index == 1))
+    np.testing.assert_allclose(place[end + 1], place[end], atol=1e-6)  # the arms stand still there
+    alone = needle_poses(replace(trajectory, psm_m=None), away)[0]
+    assert np.linalg.norm(place[away] - alone, axis=1).max() > 10.0  # mm: PSM_M holds it
+    turned = rotation @ np.swapaxes(rotation, 1, 2)
+    np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-9)
+
+
+def finger_ends(joints: np.ndarray) -> np.ndarray:
+    """Return points all over both fingers' caps, shape (T, K, 3)."""
+    tip, rotation = forward(joints)
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    opened = [np.array([0.0, side * (0.6 + 9.1 * np.sin(0.06)), 9.1 * np.cos(0.06)]) for side in (1, -1)]
+    around = 1.1 * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    around = np.append(around, [[0.0, 0.0, 1.1]], axis=0)
+    points = np.concatenate([end + around for end in opened])
+    return tip[:, None] + np.einsum("tij,kj->tki", rotation, points)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-4, 0.3))
+def test_no_point_of_a_finger_moves_further_than_the_bound(seed, step):
+    rng = np.random.default_rng(seed)
+    joints = rng.uniform(CLASSIC.lower, CLASSIC.upper, (1, 6))
+    joints[:, 2] = rng.uniform(40.0, 240.0)
+    joints = np.concatenate([joints, joints + rng.uniform(-step, step, 6) * [1, 1, 50, 1, 1, 1]])
+    moved = np.linalg.norm(np.diff(finger_ends(joints), axis=0), axis=2).max()
+    assert moved <= travel_mm(joints, "400006")[0, 2] + 1e-9
+
+
+def test_the_bound_is_worked_by_hand_where_one_joint_moves():
+    joints = np.zeros((2, 6))
+    joints[:, 2] = 115.6  # the wrist 100 mm beyond the remote centre
+    for joint, turned, expected in (
+        (0, 0.01, [3.202, 1.127, 1.194, 1.194]),  # the shaft's far end, 316.2 mm behind; the finger tip, 119.4 mm ahead
+        (2, 0.5, [0.5, 0.5, 0.5, 0.5]),
+        (3, 0.1, [0.0, 1.27, 1.94, 1.94]),
+        (5, 0.1, [0.0, 0.0, 1.03, 1.03]),
+    ):
+        moved = joints.copy()
+        moved[1, joint] += turned
+        if joint == 2:
+            np.testing.assert_allclose(travel_mm(moved, "400006")[0], expected, atol=1e-9)
+        else:
+            np.testing.assert_allclose(travel_mm(moved, "400006")[0], expected, atol=1e-3)
+
+
+def bounded(seen: list[float], looked_at: list[int], way: np.ndarray) -> np.ndarray:
+    """Bound one pair, the shaft and the pad, for a given travel of the shaft."""
+    pair = link_pairs(False)[:1]
+    return Bounds(pair, np.array(looked_at), np.array(seen)[:, None], {"PSM_A": np.tile(way[:, None], 4)}).at_least_mm(
+        0
+    )
+
+
+def test_between_looks_the_distance_is_bounded_by_the_closing_motion():
+    np.testing.assert_allclose(bounded([5.0, 4.0], [0, 4], np.arange(5.0)), [5.0, 4.0, 3.0, 3.0, 4.0])
+
+
+def test_a_nan_spoils_everything_up_to_its_neighbours():
+    found = bounded([5.0, np.nan, 5.0], [0, 3, 6], np.arange(7) * 0.1)
+    assert np.isnan(found).tolist() == [False, True, True, True, True, True, False]
+
+
+@given(some.arrays(np.float64, 40, elements=st.floats(-5.0, 5.0)))
+def test_a_distance_is_never_bounded_above_itself(steps):
+    apart = 10.0 + np.cumsum(steps)
+    looked_at = [*range(0, 39, 7), 39]
+    found = bounded(apart[looked_at], looked_at, np.append(0.0, np.cumsum(np.abs(np.diff(apart)))))
+    assert (found <= apart + 1e-9).all()
+    np.testing.assert_array_equal(found[looked_at], apart[looked_at])
+
+
+def test_both_arms_may_have_closed_in():
+    joints = small_trajectory(1, rate_hz=60.0).joints
+    pairs = link_pairs(True)
+    looked_at, seen = np.array([0, len(joints) - 1]), np.full((2, len(pairs)), 20.0)
+    motion, rest = (joints, "400006"), (np.tile(joints[:1], (len(joints), 1)), "400006")
+    one = Bounds.of({"PSM_A": motion, "PSM_M": rest}, pairs, looked_at, seen)
+    two = Bounds.of({"PSM_A": motion, "PSM_M": motion}, pairs, looked_at, seen)
+    column = [str(pair) for pair in pairs].index("PSM_A finger_1 to PSM_M finger_1")
+    np.testing.assert_allclose(20.0 - two.at_least_mm(column), 2 * (20.0 - one.at_least_mm(column)), atol=1e-9)
+    assert two.moved_mm() == pytest.approx(2 * one.moved_mm())
+
+
+def test_four_samples_of_a_plan_are_bounded_by_about_a_millimetre():
+    trajectory = small_trajectory(1, rate_hz=240.0)
+    fingers = travel_mm(trajectory.joints, "400006")[:, 2]
+    along = np.linalg.norm(np.diff(finger_ends(trajectory.joints), axis=0), axis=2).max(axis=1)
+    assert (along <= fingers + 1e-9).all()
+    assert 4 * fingers.max() < 1.5

@@ -1,6 +1,6 @@
 """The judge compares a motion with what was asked: faults of the whole are named, and no sound plan is refused.
 
-Faults of passes, jaws and transfers are in the files beside this one.
+Faults of passes, jaws and transfers are in `test_pass_comparison`.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from skills.packing import canonical, sha256
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER, PassPath, Trajectory
-from skills.verification import intent
+from skills.verification import intent, pass_comparison
 from skills.verification.arm_errors import UNCALIBRATED
 from skills.verification.deviations import LIMITS
 from skills.verification.intent import compare
@@ -236,8 +236,8 @@ def test_cells_reach_as_far_as_hysteresis_and_a_path_farther_out_is_named(hyster
 def test_a_path_that_ends_beside_its_last_cell_is_named_at_its_last_sample():
     cells = np.arange(4)[:, None] * [1, 0, 0]
     places = np.append(cells, [[3, 2, 0]], axis=0).astype(float)
-    np.testing.assert_allclose(intent._off_cells(places, cells, 0.5), [0, 0, 0, 0, 1.5])
-    np.testing.assert_allclose(intent._off_cells(places[:2], cells, 0.5), [0, 1])  # the last cell is not near
+    np.testing.assert_allclose(pass_comparison._off_cells(places, cells, 0.5), [0, 0, 0, 0, 1.5])
+    np.testing.assert_allclose(pass_comparison._off_cells(places[:2], cells, 0.5), [0, 1])  # the last cell is not near
 
 
 def test_a_start_beside_the_demonstrated_one_goes_by_the_clock_of_its_end():
@@ -265,13 +265,13 @@ def test_the_verdict_on_a_plan_has_its_request_scene_and_inexact_worlds():
     verdict = judge_plan(plan, motion, ideal(motion), policy=policy, demo=demo)
     beside, apart = clearance_of(motion, plan.scene), compare(requested_motion(plan, policy, demo), motion)
     assert verdict.report == judge(ideal(motion), motion, beside=beside, pad_is_tissue=False, intent=apart)
-    assert verdict.report.feasible and verdict.failure_in_words is None
+    assert verdict.report.feasible and verdict.failure_sentence is None
     assert verdict.scene == beside.report
-    assert (verdict.doubt.pad_top_mm, verdict.doubt.under[0].errors) == (low_mm, UNCALIBRATED)
+    assert (verdict.success.pad_top_mm, verdict.success.under[0].errors) == (low_mm, UNCALIBRATED)
     x, y, z = motion.tip_mm[len(motion) // 2].tolist()
     box = Box((x - 5.0, y - 5.0, z - 5.0), (x + 5.0, y + 5.0, z + 5.0))
     inside = replace(plan, scene=replace(plan.scene, boxes=(box,)))
-    assert "Nearest: " in judge_plan(inside, motion, ideal(motion), policy=policy, demo=demo).failure_in_words
+    assert "Nearest: " in judge_plan(inside, motion, ideal(motion), policy=policy, demo=demo).failure_sentence
 
 
 # ---- sound plans ---------------------------------------------------------------------------------------------------
@@ -319,6 +319,7 @@ def test_a_joint_that_is_unknown_makes_the_whole_pose_unknown():
     """The last joint turns the jaws: where it is unknown, the place of the tip is not trusted either."""
     joints = np.tile([0.1, 0.2, 0.12, 0.3, 0.4, 0.5], (2, 1))
     joints[1, 5] = np.nan
-    tip, rotation = intent._poses(joints, "400006")
+    found = intent._poses(joints, "400006")
+    tip, rotation = found.tip_mm, found.rotation
     assert np.isfinite(tip[0]).all() and np.isfinite(rotation[0]).all()
     assert np.isnan(tip[1]).all() and np.isnan(rotation[1]).all()

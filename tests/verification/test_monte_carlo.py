@@ -1,16 +1,17 @@
-"""Monte Carlo variations of a plan: the draws, the failures, and the counts."""
+"""The estimate of success: laws, cases by hand, and a second method that repeats it world by world."""
 
 import json
 import subprocess
 import sys
 from dataclasses import asdict, replace
-from math import erf, nan, radians, sqrt
+from math import cos, erf, nan, radians, sin, sqrt
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import skills
+from skills.arithmetic import wilson
 from skills.errors import BadInput, BadSettings
 from skills.kinematics import JAW_TIP_MM, POINTING_DOWN, matrix_of
 from skills.planning.handoff import HOLDING_RAD, JAW_CLOSED_RAD, JAW_OPEN_RAD, NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
@@ -27,19 +28,20 @@ from skills.verification.clearance import (
 )
 from skills.verification.error_draws import Displaced, draw
 from skills.verification.gates import Limits
-from skills.verification.monte_carlo import doubt, looked_at, scene_of
-from skills.verification.probabilities import Doubt, DoubtSettings, DoubtUnder
+from skills.verification.monte_carlo import estimate_success, looked_at, scene_of
+from skills.verification.probabilities import EstimateSettings, EstimateUnder, SuccessEstimate
 from tests.arms import EXACT
 from tests.by_day import some
-from tests.verification.test_catch import APPROACH, OPENING_RAD, PLANNED
+from tests.verification import worlds
+from tests.verification.test_clearance import APPROACH, OPENING_RAD, PLANNED
 
 PAD_TOP_MM = -150.0  # 5 mm under the lowest finger tips
 BASE_MM = (160.0, 20.0, 20.0)
 BASE_XYZW = (0.0, 0.0, float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5))))
 PSM_M = PsmM(APPROACH, BASE_MM, BASE_XYZW)
 PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10, 55, -120], [5, 55, -125]], dtype=float)
-NO_DOUBT = DoubtSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
-FEW = DoubtSettings(variations=100)
+NO_DOUBT = EstimateSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
+FEW = EstimateSettings(variations=100)
 
 
 def pass_path(shift_mm: float = 0.0, with_a2: bool = True) -> PassPath:
@@ -67,12 +69,14 @@ def of_tips(mean_mm: float) -> ArmErrors:
     return only(tip_bias_mm=mean_mm / MEAN_LENGTH)
 
 
-def judged(trajectory: Trajectory = ALONE, approach=APPROACH, pad_top_mm: float = PAD_TOP_MM, **given) -> Doubt:
+def judged(
+    trajectory: Trajectory = ALONE, approach=APPROACH, pad_top_mm: float = PAD_TOP_MM, **given
+) -> SuccessEstimate:
     given = {"settings": FEW, "errors": of_tips(0.65), **given}
-    return doubt(trajectory, approach_m=approach, pad_top_mm=pad_top_mm, **given)
+    return estimate_success(trajectory, approach_m=approach, pad_top_mm=pad_top_mm, **given)
 
 
-def under(found: Doubt) -> DoubtUnder:
+def under(found: SuccessEstimate) -> EstimateUnder:
     return found.under[0]
 
 
@@ -95,7 +99,7 @@ def test_catching_is_as_likely_as_the_integral_over_all_offsets(errors):
     good &= np.abs(y) * np.cos(OPENING_RAD) + half <= depth * np.sin(OPENING_RAD)
     good &= np.abs(x) <= NEEDLE_RADIUS_MM * np.sin(radians(15))
     expected = np.einsum("ijk,i,j,k", good.astype(float), weight, weight, weight)
-    settings = DoubtSettings(variations=2000, needle_rad=0.0)
+    settings = EstimateSettings(variations=2000, needle_rad=0.0)
     caught = under(judged(motion(1), settings=settings, errors=errors)).passes[0].caught
     assert caught.lower - 0.01 <= expected <= caught.upper + 0.01  # the grid's own error is a few thousandths
 
@@ -174,7 +178,7 @@ def test_elsewhere_is_the_same_way_for_both_arms_whatever_their_bases():
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
 def test_the_pad_is_cleared_as_often_as_the_error_function_says(normal):
-    settings = DoubtSettings(variations=2000, suture_point_mm=5.0 if normal[2] < 1 else 0.0)  # the pad moves along
+    settings = EstimateSettings(variations=2000, suture_point_mm=5.0 if normal[2] < 1 else 0.0)  # the pad moves along
     arm = scene_of(ALONE, 0, 0.0, 0.06).arms[0]
     links = arm.links(arm.joints)
     ends = np.concatenate([links.begin_mm, links.end_mm], axis=1) @ normal - np.tile([4.0, 3.6, 1.1, 1.1], 2)
@@ -311,7 +315,7 @@ def test_psm_m_beside_catches_what_its_wanted_pose_alone_catches():
     "size", some(["registration_mm", "registration_deg", "wrist_deg", "tip_bias_mm", "tip_noise_mm"], 3)
 )
 def test_more_error_never_helps_where_nothing_else_is_in_doubt(size):
-    settings = DoubtSettings(variations=100, suture_point_mm=0.0, needle_rad=0.0)
+    settings = EstimateSettings(variations=100, suture_point_mm=0.0, needle_rad=0.0)
     asked = {"settings": settings, "trajectory": motion(1, PSM_M)}
     counts = [under(judged(errors=only(**{size: value}), **asked)).plan.count for value in (0.0, 0.5, 2.0, 12.0)]
     assert counts == sorted(counts, reverse=True)
@@ -319,7 +323,7 @@ def test_more_error_never_helps_where_nothing_else_is_in_doubt(size):
 
 
 def test_a_plan_of_two_passes_succeeds_about_as_often_as_both_of_them():
-    found = under(judged(settings=DoubtSettings(variations=1000)))
+    found = under(judged(settings=EstimateSettings(variations=1000)))
     one, other = (each.succeeds.probability for each in found.passes)
     assert found.plan.probability == pytest.approx(one * other, abs=0.04)  # they are drawn independently
     assert found.plan.count <= min(each.succeeds.count for each in found.passes)
@@ -340,7 +344,7 @@ def test_a_fault_is_counted_in_every_variation_that_has_it():
 @pytest.mark.parametrize("enters", ["after_A1", "start"])
 def test_between_the_poses_looked_at_nothing_comes_much_nearer(enters):
     whole = scene_of(motion(1, replace(PSM_M, enters=enters)), 0, PAD_TOP_MM, OPENING_RAD)
-    thin = looked_at(whole, DoubtSettings().stretches)
+    thin = looked_at(whole, EstimateSettings().stretches)
     assert len(thin.phase) < 70 < len(whole.phase) / 5
     drawn = draw(5, 0, 20, 1, suture_point_mm=5.0, needle_rad=0.0)
     every, some = (nearest_mm(scene, drawn) for scene in (whole, thin))
@@ -473,10 +477,10 @@ def test_joints_that_are_not_numbers_go_wrong_everywhere():
 def test_doubts_that_cannot_be_meant_are_refused():
     for wrong in ({"variations": 0}, {"stretches": 0}):
         with pytest.raises(BadSettings, match="1 to 1000 stretches"):
-            DoubtSettings(**wrong)
+            EstimateSettings(**wrong)
     for wrong in ({"suture_point_mm": nan}, {"needle_rad": -0.1}, {"stated_rad": nan}):
         with pytest.raises(BadSettings, match="finite"):
-            DoubtSettings(**wrong)
+            EstimateSettings(**wrong)
     with pytest.raises(BadInput, match="height"):
         judged(pad_top_mm=nan)
     for normal in ((0.0, 0.0, 2.0), (nan, 0.0, 1.0)):
@@ -495,3 +499,98 @@ def test_worlds_are_counted_by_hand():
     assert (first.succeeds.count, first.clear.count, first.caught and first.caught.count) == (2, 3, 3)
     assert (second.succeeds.count, second.clear.count, second.caught) == (3, 3, None)
     assert (first.faults.reach, first.faults.place, first.faults.pad, second.faults.pad) == (1, 1, None, 1)
+
+
+Pad = tuple[float, tuple[float, float, float]]  # height along the normal, mm, and the normal
+TIPS = ArmErrors("tips alone", 0, 0, 0, 0.65 / MEAN_LENGTH, 0, 0, dict.fromkeys(SIZES, "a test"))
+# An independent Monte Carlo of the first judge's plan, with these errors added to a tip error of 0.65 mm on average.
+FOUND_BEFORE = {
+    "registration off by 1 mm": (replace(TIPS, registration_mm=1.0), 0.90),
+    "registration off by 2 mm": (replace(TIPS, registration_mm=2.0), 0.48),
+    "registration off by 1 degree": (replace(TIPS, registration_deg=1.0), 0.28),
+    "wrists off by 3 degrees": (replace(TIPS, wrist_deg=3.0), 0.91),
+    "wrists off by 5 degrees": (replace(TIPS, wrist_deg=5.0), 0.66),
+}
+
+
+def probability(
+    trajectory: Trajectory,
+    errors: ArmErrors,
+    pad: Pad = (PAD_TOP_MM, (0.0, 0.0, 1.0)),
+    variations: int = 1000,
+    seed: int = 0,
+) -> float:
+    settings = EstimateSettings(variations=variations)
+    tools = Limits(clearance_bodies_mm=-1e6)  # the other worlds have no outer bodies
+    pad_top_mm, pad_normal = pad
+    asked = {"errors": errors, "settings": settings, "limits": tools, "seed": seed}
+    found = estimate_success(trajectory, approach_m=None, pad_top_mm=pad_top_mm, pad_normal=pad_normal, **asked)
+    return found.under[0].plan.probability
+
+
+@pytest.mark.parametrize(("errors", "found"), some(FOUND_BEFORE.values(), 3), ids=FOUND_BEFORE)
+def test_errors_that_the_first_judge_left_out_cost_as_much_as_was_found(errors, found):
+    assert probability(motion(1, PSM_M), errors) == pytest.approx(found, abs=0.04)
+
+
+def some_plan(seed: int) -> tuple[Trajectory, ArmErrors, Pad]:
+    """Return a plan of one pass with an approach, errors and a pad of its own; two of three pads slope."""
+    rng = np.random.default_rng(seed)
+    approach = np.array(PSM_M.approach) + rng.uniform(-0.15, 0.15, 3)
+    path = PATH_MM + rng.uniform(-4, 4, 3) + np.append(np.zeros((1, 3)), rng.uniform(-2, 2, (3, 3)), axis=0)
+    psm_m = replace(PSM_M, approach=tuple(approach.tolist()))
+    one = PassPath(path, POINTING_DOWN, realign(POINTING_DOWN, approach).rotation)
+    below_mm, slope, towards = rng.uniform(2.0, 6.0), radians(12.0 * (seed % 3)), float(seed)
+    normal = (sin(slope) * cos(towards), sin(slope) * sin(towards), cos(slope))
+    pad_top_mm = float((path @ normal).min()) - 10.2 - below_mm
+    most = rng.uniform(0.2, 1.0)  # so that some plans have small errors alone
+    errors = replace(
+        TIPS,
+        registration_mm=most * rng.uniform(0, 2.4),
+        registration_deg=most * rng.uniform(0, 0.9),
+        wrist_deg=most * rng.uniform(0, 3),
+        tip_bias_mm=most * rng.uniform(0, 0.8),
+        tip_noise_mm=most * rng.uniform(0, 0.5),
+        tip_correlation_s=rng.choice([0.0, 0.3, 2.0]),
+    )
+    return time_parametrise([one], rate_hz=100.0, psm_m=psm_m), errors, (pad_top_mm, normal)
+
+
+def compared(plans: int, variations: int, tried: int) -> tuple[list[float], int, list[float]]:
+    """Compare plans from 0.2 to 0.99 with as many other worlds of each.
+
+    Each plan has draws of its own: with the same ones for all, all closed forms are off to the same side.
+
+    Returns:
+        The closed form's probabilities, the number of those within the other worlds' Wilson interval, and the
+        differences in standard deviations of both estimates.
+    """
+    found, agree, off, seed = [], 0, [], 0
+    while len(found) < plans:
+        trajectory, errors, pad = some_plan(seed)
+        closed = probability(trajectory, errors, pad, variations, seed)
+        if 0.2 <= closed <= 0.99:
+            count = worlds.successes(trajectory, errors, *pad, tried, 2000 + seed)
+            lower, upper = wilson(count, tried)
+            found.append(closed)
+            agree += lower <= closed <= upper
+            both = (closed * variations + count) / (variations + tried)
+            off.append((closed - count / tried) / sqrt(both * (1 - both) * (1 / variations + 1 / tried)))
+        seed += 1
+    return found, agree, off
+
+
+def test_a_plan_succeeds_as_often_as_in_independent_worlds():
+    # So many variations that the closed form's own error is a quarter of the worlds': Wilson's interval has that alone.
+    found, agree, _ = compared(plans=1, variations=1500, tried=80)
+    assert agree == 1, found  # the interval holds 95 %, and the seed is always the same
+
+
+@pytest.mark.nightly
+def test_50_plans_succeed_as_often_as_in_independent_worlds():
+    found, agree, off = compared(plans=50, variations=4000, tried=300)
+    bias = sum(off) / sqrt(len(off))  # of deviation 1 if there is none
+    print(f"{agree} of 50 agree, {min(found):.2f} to {max(found):.2f}; all together off by {bias:.1f} deviations")
+    assert agree >= 45, found
+    assert abs(bias) < 3, off
+    assert min(found) < 0.3 and max(found) > 0.95

@@ -25,7 +25,7 @@ from skills.verification.playback import CLEARANCE_SEEN_MM
 from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of, flat_tissue, needle_from_tissue
 from skills.verification.verdict import judge
 from tests.planning.motions import ideal_playback
-from tests.verification.test_playback import TRAJECTORY, beside, with_psm_m
+from tests.verification.test_verdict import TRAJECTORY, beside, with_psm_m
 
 ARM = links_of(TRAJECTORY.joints, TRAJECTORY.instrument, openings(TRAJECTORY.arms[0]))
 LOWEST = (np.minimum(ARM.begin_mm[..., 2], ARM.end_mm[..., 2]) - RADII_MM).min(axis=1)  # of each sample

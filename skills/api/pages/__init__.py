@@ -19,6 +19,7 @@ from skills.api.authorisation import Caller, Role
 from skills.api.pages.assets import build
 from skills.api.pages.filters import FILTERS
 from skills.errors import UnknownFormat
+from skills.fields import plain_json
 from skills.formats import READABLE
 
 HTML = "text/html"
@@ -65,6 +66,7 @@ def templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": plain_json}
     made.filters |= FILTERS
     return made
 

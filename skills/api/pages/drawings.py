@@ -13,7 +13,7 @@ pixels. Colour never stands alone:
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from math import ceil, floor, hypot, log10
@@ -28,16 +28,16 @@ from skills.arrays import Floats
 from skills.comparison.combining import Combined
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import smoothed_speed
-from skills.demonstration.quality import pieces_of, times_in_words
+from skills.demonstration.quality import describe_count, pieces_of
 from skills.gridworld import paper
 from skills.gridworld.grid import GridPath, discretisation_rmse
 from skills.learning.certificate import Coverage
 from skills.library.policies.cards import Card
 from skills.schemas.comparison import Atlas
+from skills.schemas.demos import Demonstration
 from skills.schemas.scores import CurvePoint
 from skills.scoring.deviation import Deviation
 
-Report = Mapping[str, Any]
 VIEW, COURSE = (320, 328), (1000, 190)  # size of a view along an axis, and of a plot over time or along the path
 MOST_POINTS = 1500  # per line: more cannot be seen
 AXES = "xyz"
@@ -194,24 +194,23 @@ def _course(end: float, top: float, start: float = 0.0) -> Plot:
 # ---- the report --------------------------------------------------------------------------------------------------
 
 
-def report_page(about: Mapping[str, Any], report: Report, demo: Demo, path: GridPath) -> str:
+def report_page(about: Demonstration, demo: Demo, path: GridPath) -> str:
     """Return the HTML of the quality report to the surgeon: advice, path, speed and figures.
 
     Args:
-        about: The demonstration's JSON (`skills.library.recordings.demos.demo_json`).
-        report: The report (`skills.library.recordings.demos.full_report`).
-        demo: The demonstration.
+        about: The demonstration, with its whole report.
+        demo: Its motion.
         path: Its path in its grid.
     """
     return standalone(
         "demo_report",
         about=about,
-        report=report,
+        report=about.report,
         views=path_views(demo, path),
-        speed=speed(demo, report["a1_s"]),
+        speed=speed(demo, about.report.a1_s),
         pauses=bool(demo.pauses),
         partner=None if demo.partner is None else demo.partner.arm,
-        times=times_in_words,
+        times=describe_count,
     )
 
 
@@ -466,7 +465,7 @@ def chart(atlas: Atlas) -> Markup:
     scale = float(min(*room, 1e3))  # pixels per unit along both axes; limited, for the case that all points coincide
     seen = (places - (low + high) / 2) * [scale, -scale] + [WIDE / 2, (HIGH - MARGIN) / 2]
     drawn, of = marks(atlas), {one.medoid: one.surgeon for one in atlas.surgeons}
-    asked = None if atlas.whose is None else atlas.whose.demo
+    asked = None if atlas.recognised is None else atlas.recognised.demo
     spots, rings = [], []
     for one, (x, y) in zip(atlas.demos, seen.round(1).tolist(), strict=True):
         about = element("title", f"{one.surgeon}, session {one.session or 'not named'}, cluster {one.cluster}")

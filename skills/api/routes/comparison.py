@@ -9,7 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import Db, Digest, Slug, Tell
+from skills.api.dependencies import Db, Digest, Parse, Slug
 from skills.api.openapi import gives, router_of, says
 from skills.api.pages import drawings, render
 from skills.api.responses import Giving, say
@@ -21,7 +21,8 @@ from skills.library.comparison.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.comparison.recognition import recognise_recording
 from skills.library.operation import styles
-from skills.library.people.catalogue import find_surgeon, find_suture_type
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
 from skills.schemas.requests import COUNT, DIGEST, SLUG
 from skills.schemas.scores import Progress, Score, ScoreIn
@@ -87,7 +88,7 @@ def get_nearest(
 def recognise(
     suture: Slug,
     db: Db,
-    tell: Tell,
+    parse: Parse,
     give: Giving,
     recording: Annotated[str, Query(pattern=DIGEST, description="Digest of a recording with a demonstration.")],
 ) -> Response:
@@ -95,16 +96,16 @@ def recognise(
 
     It reads the recordings of the suture type, so it takes seconds for tens of recordings.
     """
-    return give(recognise_recording(db, recording, suture, tell))
+    return give(recognise_recording(db, recording, suture, parse))
 
 
 @score_router.post("/scores", dependencies=[needs("reader")], **says(Score, 404, 409, 410))
-def score(body: ScoreIn, db: Db, tell: Tell) -> Response:
+def score(body: ScoreIn, db: Db, parse: Parse) -> Response:
     """Score a motion: its figures compared with the reference's, its deviation, percentiles, and a curve over time.
 
     Research use only; not a credential.
     """
-    return say(scores.score(db, body, tell))
+    return say(scores.score(db, body, parse))
 
 
 @score_router.get("/surgeons/{surgeon}/progress", dependencies=[needs("reader")], **gives(Progress, 404, 409, 410))

@@ -67,7 +67,7 @@ def get_dataset(
 def get_dataset_episodes(dataset: Digest, db: Db, give: Giving) -> Response:
     """Return the recording and the demonstrations of each episode of a dataset, which does not name them itself."""
     with db.reading() as session:
-        return give(datasets.episodes_json(session, dataset))
+        return give(datasets.episodes_of_dataset(session, dataset))
 
 
 @router.delete("/datasets/{dataset}", dependencies=[needs("trainer")], **ends(404))

@@ -4,10 +4,9 @@ from functools import partial
 from typing import Annotated
 
 from fastapi import Query, Request, Response
-from sqlalchemy import select
 
 from skills.api.authorisation import erasing_is_for_admins, needs
-from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, RowCursor, Tell
+from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, Parse, RowCursor
 from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
@@ -17,13 +16,12 @@ from skills.api.routes.recordings import RAW_BODY
 from skills.api.streams import Stream, stored_pieces
 from skills.api.strict_json import Strict
 from skills.api.uploads import Incoming
-from skills.db.models import StoredRewardMap
 from skills.formats import BYTES, MEDIA_TYPES
 from skills.library.operation import locks
 from skills.library.operation.sweep import drop_contents, sweep_erased
 from skills.library.people import erasure
 from skills.library.recordings import demos
-from skills.library.recordings.demos import demo_json, path_json, reward_map_json
+from skills.library.recordings.reports import full_report
 from skills.schemas import OutcomeAsked, Page
 from skills.schemas.demos import DemoIn, Demonstration, DemoPath, OutcomeIn, RewardMap
 from skills.schemas.recordings import TableIn
@@ -41,19 +39,23 @@ class DemoUpload(DemoIn, TableIn):
 
 
 @uploads.post("/demos", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **makes(Demonstration, 404, 409, 410))
-def upload_demo(upload: Incoming, asked: Annotated[DemoUpload, Query()], db: Db, read: Tell, actor: Actor) -> Response:
+def upload_demo(
+    upload: Incoming, asked: Annotated[DemoUpload, Query()], db: Db, parse: Parse, actor: Actor
+) -> Response:
     """Store a recording and one demonstration of it, both or neither."""
-    return _stored(demos.upload_demo(db, upload.read_as(asked.said), asked, actor, read))
+    return _stored(demos.upload_demo(db, upload.read_as(asked), asked, actor, parse))
 
 
 @router.post("/recordings/{recording}/demos", dependencies=[needs("uploader")], **makes(Demonstration, 404, 409, 410))
-def add_demo(recording: Digest, body: DemoIn, db: Db, read: Tell, actor: Actor) -> Response:
+def add_demo(recording: Digest, body: DemoIn, db: Db, parse: Parse, actor: Actor) -> Response:
     """Cut one demonstration out of a stored recording."""
-    return _stored(demos.add_demo(db, recording, body, actor, read))
+    return _stored(demos.add_demo(db, recording, body, actor, parse))
 
 
 def _stored(added: demos.Added) -> Response:
-    return stored(demo_json(added.row, added.taken), added.new, f"/demos/{added.row.sha256}")
+    # The part that this request named, which may name the stored one in another way.
+    demo = Demonstration.model_validate(added.row).model_copy(update={"segment": added.segment})
+    return stored(demo, added.new, f"/demos/{demo.sha256}")
 
 
 @router.get("/demos", dependencies=[needs("reader")], **gives_page(Page[Demonstration], 404, 410))
@@ -75,14 +77,14 @@ def list_demos(
     """List demonstrations, the newest first."""
     with db.reading() as session:
         found = demos.list_demos(session, limit, cursor, surgeon, suture, recording, active, outcome)
-        return give.page([demo_json(row) for row in found], limit, found[-1].row if found else None)
+        return give.page([Demonstration.model_validate(row) for row in found], limit, found[-1].row if found else None)
 
 
 @router.get("/demos/{demo}", dependencies=[needs("reader")], **gives(Demonstration, 404))
 def get_demo(demo: Digest, db: Db, give: Giving) -> Response:
     """Return a demonstration."""
     with db.reading() as session:
-        return give(demo_json(demos.find_demo(session, demo)))
+        return give(Demonstration.model_validate(demos.find_demo(session, demo)))
 
 
 @router.get(
@@ -114,7 +116,7 @@ def get_demo_recording(
 def get_path(demo: Digest, db: Db, give: Giving) -> Response:
     """Return a demonstration's states in the grid and its motion as recorded."""
     with db.reading() as session:
-        return give(path_json(demos.shown_demo(session, demo)))
+        return give(demos.path_of_demo(demos.shown_demo(session, demo)))
 
 
 @router.get(
@@ -125,21 +127,19 @@ def get_report(demo: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Re
     as_page = wants_page(accept, "A report")
     with db.reading() as session:
         row = demos.shown_demo(session, demo) if as_page else demos.find_demo(session, demo)
-        about, report = demo_json(row), demos.full_report(row)
+        about = Demonstration.model_validate(row).model_copy(update={"report": full_report(row)})
         if as_page:
-            page = give.bytes(report_page(about, report, row.demo, row.path).encode(), HTML)
+            page = give.bytes(report_page(about, row.demo, row.path).encode(), HTML)
             page.headers.update(standalone_headers("demo_report"))
             return page
-        return give(about | {"report": report})
+        return give(about)
 
 
 @router.get("/demos/{demo}/reward-map", dependencies=[needs("reader")], **gives(RewardMap, 404, 409))
 def get_reward_map(demo: Digest, db: Db, give: Giving) -> Response:
     """Return the rewards of Algorithm 1 for a demonstration, without the states whose reward is `other`."""
     with db.reading() as session:
-        row = demos.shown_demo(session, demo)
-        kept = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == row.row)).one()
-        return give(reward_map_json(row, kept))
+        return give(demos.reward_map_of(session, demos.shown_demo(session, demo)))
 
 
 @router.put("/demos/{demo}/outcome", dependencies=[needs("releaser")], **gives(Demonstration, 404, 412))
@@ -154,8 +154,8 @@ def mark_demo(
         surgeon = demos.find_demo(session, demo).surgeon.slug
     with db.writing([locks.surgeon(surgeon)]) as session:
         if if_match:
-            refuse_changed(demo_json(demos.find_demo(session, demo)), if_match)
-        return give(demo_json(demos.mark_demo(session, demo, body.outcome, body.reason, actor)))
+            refuse_changed(Demonstration.model_validate(demos.find_demo(session, demo)), if_match)
+        return give(Demonstration.model_validate(demos.mark_demo(session, demo, body.outcome, body.reason, actor)))
 
 
 @router.delete("/demos/{demo}", dependencies=[needs("releaser"), erasing_is_for_admins], **ends(404, 409, 412))
@@ -166,12 +166,12 @@ def withdraw_demo(
     dropped: erasure.Dropped = []
     with db.reading() as session:
         found = demos.find_demo(session, demo)
-        refuse_changed(demo_json(found), if_match)
+        refuse_changed(Demonstration.model_validate(found), if_match)
         surgeon, erased = found.surgeon.slug, erasure.erased_with(session, found.surgeon, found) if erase else []
     drop_contents(db, erased)
     with db.writing(None if erase else [locks.surgeon(surgeon)]) as session:
         if if_match:
-            refuse_changed(demo_json(demos.find_demo(session, demo)), if_match)
+            refuse_changed(Demonstration.model_validate(demos.find_demo(session, demo)), if_match)
         demos.withdraw_demo(session, demo, actor)
         if erase:
             dropped = erasure.erase_demo(session, demo, actor)

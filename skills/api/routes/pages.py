@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from skills import errors
 from skills.api.authorisation import Asking, Caller, needs, open_to_all
-from skills.api.dependencies import Configured, Db, Digest, Limit, RowCursor, Slug, SlugCursor, Tell
+from skills.api.dependencies import Configured, Db, Digest, Limit, Parse, RowCursor, Slug, SlugCursor
 from skills.api.pages import drawings, render
 from skills.api.pages.assets import assets, build
 from skills.api.responses import JSON
@@ -22,7 +22,7 @@ from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library.comparison import scores
 from skills.library.operation import jobs, overview, styles, views
-from skills.library.people.catalogue import list_surgeons
+from skills.library.people.surgeons import list_surgeons
 from skills.library.plans.plans import find_plan, followed_plan, hands_over, plan_in_words
 from skills.library.plans.playbacks import headline_of
 from skills.library.plans.replay import refusal_of_bag
@@ -168,7 +168,7 @@ def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
 def show_score(
     demo: Digest,
     page: Page,
-    tell: Tell,
+    tell: Parse,
     surgeon: Annotated[str, Query(max_length=64)] = "",
     task: Annotated[str, Query(max_length=64, pattern="^[A-Za-z_]*$")] = "",
 ) -> Response:
@@ -234,7 +234,7 @@ def show_recording(recording: Digest, page: Page, surgeon: Picked = None, suture
 
 
 @router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
-def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Tell) -> Response:
+def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Parse) -> Response:
     """Return the data of a recording's timeline."""
     return _json(views.traces_of(db, recording, tell))
 

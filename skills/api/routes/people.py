@@ -11,8 +11,7 @@ from skills.api.responses import Condition, Giving, refuse_changed, say, stored
 from skills.api.strict_json import Strict
 from skills.library.operation import locks
 from skills.library.operation.sweep import drop_contents, sweep_erased
-from skills.library.people import catalogue, erasure
-from skills.library.people.catalogue import surgeon_json, suture_json
+from skills.library.people import erasure, surgeons, suture_types
 from skills.library.people.keys import about_key, create_key, list_keys, revoke_key
 from skills.schemas import Page, SkillLevel
 from skills.schemas.people import Key, KeyIn, NewKey, Surgeon, SurgeonIn, SutureType, SutureTypeIn
@@ -31,10 +30,10 @@ def put_surgeon(
     """Create or replace a surgeon under a pseudonym; fields that are left out are cleared."""
     with db.writing([locks.surgeon(surgeon)]) as session:
         if if_match or if_none_match:
-            known = catalogue.known_surgeon(session, surgeon)
-            refuse_changed(known and surgeon_json(known), if_match, if_none_match)
-        row, created = catalogue.put_surgeon(session, surgeon, body.model_dump(mode="json"), actor)
-        return stored(surgeon_json(row), created, f"/surgeons/{surgeon}")
+            known = surgeons.known_surgeon(session, surgeon)
+            refuse_changed(known and Surgeon.model_validate(known), if_match, if_none_match)
+        row, created = surgeons.put_surgeon(session, surgeon, body, actor)
+        return stored(Surgeon.model_validate(row), created, f"/surgeons/{surgeon}")
 
 
 @router.get("/surgeons", dependencies=[needs("reader")], **gives_page(Page[Surgeon]))
@@ -48,28 +47,28 @@ def list_surgeons(
 ) -> Response:
     """List the surgeons in the order of their pseudonyms: all, or those whose pseudonym contains the search."""
     with db.reading() as session:
-        found = catalogue.list_surgeons(session, limit, cursor, search, skill_level)
-        return give.page([surgeon_json(row) for row in found], limit, found[-1].slug if found else None)
+        found = surgeons.list_surgeons(session, limit, cursor, search, skill_level)
+        return give.page([Surgeon.model_validate(row) for row in found], limit, found[-1].slug if found else None)
 
 
 @router.get("/surgeons/{surgeon}", dependencies=[needs("reader")], **gives(Surgeon, 404, 410))
 def get_surgeon(surgeon: Slug, db: Db, give: Giving) -> Response:
     """Return a surgeon."""
     with db.reading() as session:
-        return give(surgeon_json(catalogue.find_surgeon(session, surgeon)))
+        return give(Surgeon.model_validate(surgeons.find_surgeon(session, surgeon)))
 
 
 @router.delete("/surgeons/{surgeon}", dependencies=[needs("admin")], **ends(404, 410, 412))
 def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, if_match: Condition = None) -> None:
     """Erase a surgeon and everything derived from their data, permanently."""
     with db.reading() as session:
-        found = catalogue.find_surgeon(session, surgeon)
-        refuse_changed(surgeon_json(found), if_match)
+        found = surgeons.find_surgeon(session, surgeon)
+        refuse_changed(Surgeon.model_validate(found), if_match)
         recordings = erasure.erased_with(session, found)
     drop_contents(db, recordings)
     with db.writing() as session:
         if if_match:
-            refuse_changed(surgeon_json(catalogue.find_surgeon(session, surgeon)), if_match)
+            refuse_changed(Surgeon.model_validate(surgeons.find_surgeon(session, surgeon)), if_match)
         dropped = erasure.erase_surgeon(session, surgeon, actor)
     sweep_erased(db)
     db.forget()  # erased data must not stay in SQLite's write-ahead log
@@ -85,10 +84,10 @@ def put_suture_type(
     """Create or replace a suture type; fields that are left out get their defaults."""
     with db.writing() as session:
         if if_match or if_none_match:
-            known = catalogue.known_suture_type(session, suture)
-            refuse_changed(known and suture_json(known), if_match, if_none_match)
-        row, created = catalogue.put_suture_type(session, suture, body.model_dump(), actor)
-        return stored(suture_json(row), created, f"/suture-types/{suture}")
+            known = suture_types.known_suture_type(session, suture)
+            refuse_changed(known and SutureType.model_validate(known), if_match, if_none_match)
+        row, created = suture_types.put_suture_type(session, suture, body, actor)
+        return stored(SutureType.model_validate(row), created, f"/suture-types/{suture}")
 
 
 @router.get("/suture-types", dependencies=[needs("reader")], **gives_page(Page[SutureType]))
@@ -97,15 +96,15 @@ def list_suture_types(
 ) -> Response:
     """List the suture types: all, or those whose name, family or slug contains the search."""
     with db.reading() as session:
-        found = catalogue.list_suture_types(session, limit, cursor, search)
-        return give.page([suture_json(row) for row in found], limit, found[-1].slug if found else None)
+        found = suture_types.list_suture_types(session, limit, cursor, search)
+        return give.page([SutureType.model_validate(row) for row in found], limit, found[-1].slug if found else None)
 
 
 @router.get("/suture-types/{suture}", dependencies=[needs("reader")], **gives(SutureType, 404))
 def get_suture_type(suture: Slug, db: Db, give: Giving) -> Response:
     """Return a suture type."""
     with db.reading() as session:
-        return give(suture_json(catalogue.find_suture_type(session, suture)))
+        return give(SutureType.model_validate(suture_types.find_suture_type(session, suture)))
 
 
 key_router = router_of(route_class=Strict, tags=["keys"], max_body_size=MEBIBYTE)
@@ -125,10 +124,10 @@ def list_all_keys(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = N
 def make_key(body: KeyIn, db: Db, actor: Actor, request: Request) -> Response:
     """Create a key; only this response ever contains its secret."""
     with db.writing() as session:
-        key, text = create_key(
+        key, secret = create_key(
             session, body.owner, body.role, actor, expires_at=body.expires_at, surgeons=body.surgeons
         )
-        made = about_key(key) | {"secret": text}
+        made = NewKey(**vars(about_key(key)), secret=secret)
     request.app.state.access.forget()
     return say(made, 201, {"Cache-Control": "no-store"})  # no cache may store the secret
 

@@ -16,7 +16,7 @@ from fastapi import Query, Request, Response
 from pydantic import Field
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import Actor, Configured, Db, Digest, Jobs, Limit, Read, RowCursor, Tell, room_for_a_job
+from skills.api.dependencies import Actor, Configured, Db, Digest, Jobs, Limit, Parse, Read, RowCursor, room_for_a_job
 from skills.api.openapi import gives, gives_file, gives_page, makes, router_of, says, starts_job
 from skills.api.pages import render
 from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
@@ -317,7 +317,7 @@ SPAN, MOST_MARKS = r"^\d{1,6}(\.\d{1,6})?-\d{1,6}(\.\d{1,6})?$", 20
     dependencies=[needs("reader")],
     **gives(MotionTimeline, 404, 409, 415, as_well=(MCAP,)),
 )
-def get_timeline(source: Source, digest: Digest, db: Db, tell: Tell, give: Giving, accept: Accept = "*/*") -> Response:
+def get_timeline(source: Source, digest: Digest, db: Db, tell: Parse, give: Giving, accept: Accept = "*/*") -> Response:
     """Return a recording, a demonstration, a learnt path or a plan as columns on one clock, to be played.
 
     At most 200 rows a second and 24,000 in all. `Accept: application/vnd.mcap` returns an MCAP file for viewers such as

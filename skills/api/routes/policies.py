@@ -33,7 +33,8 @@ from skills.library.operation import locks
 from skills.library.operation.integrity import learnt
 from skills.library.operation.jobs import PART, attempts_to_submit, count
 from skills.library.operation.proofs import head_over, sign_files
-from skills.library.people.catalogue import find_surgeon, find_suture_type
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.plans.tries import request_try
 from skills.library.policies import releases, versions
 from skills.library.policies.cards import Card, card_of

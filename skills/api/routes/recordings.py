@@ -6,7 +6,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import Field
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import Actor, Db, Digest, Limit, RowCursor, Tell
+from skills.api.dependencies import Actor, Db, Digest, Limit, Parse, RowCursor
 from skills.api.openapi import ends, gives, gives_page, makes, router_of, says
 from skills.api.pages import render
 from skills.api.responses import Giving, say, stored
@@ -18,8 +18,8 @@ from skills.library.operation import locks, overview
 from skills.library.operation.sweep import drop_contents, sweep_erased
 from skills.library.people import erasure
 from skills.library.recordings import proposals, recordings
-from skills.library.recordings.proposals import proposal_json
-from skills.library.recordings.recordings import find_recording, recording_json
+from skills.library.recordings.proposals import describe_proposal
+from skills.library.recordings.recordings import describe_recording, find_recording
 from skills.schemas import Page, ProposalState
 from skills.schemas.demos import Proposal, ProposalIn
 from skills.schemas.recordings import Recording, RecordingPreview, RecordingSummary, TableIn
@@ -55,17 +55,17 @@ class RecordingQuery(TableIn):
     "/recordings", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **makes(Recording, 404, 409, 410)
 )
 def add_recording(
-    upload: Incoming, asked: Annotated[RecordingQuery, Query()], db: Db, read: Tell, actor: Actor
+    upload: Incoming, asked: Annotated[RecordingQuery, Query()], db: Db, parse: Parse, actor: Actor
 ) -> Response:
     """Store a recording, once for equal bytes, and propose the hand-offs in it."""
-    row, created = recordings.store_recording(db, upload.read_as(asked.said), actor, read, asked.surgeon)
-    return stored(recording_json(row), created, f"/recordings/{row.sha256}")
+    row, created = recordings.store_recording(db, upload.read_as(asked), actor, parse, asked.surgeon)
+    return stored(describe_recording(row), created, f"/recordings/{row.sha256}")
 
 
 @uploads.post("/recordings/preview", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **says(RecordingPreview))
-def preview_recording(upload: Incoming, asked: Annotated[TableIn, Query()], read: Tell) -> Response:
+def preview_recording(upload: Incoming, asked: Annotated[TableIn, Query()], parse: Parse) -> Response:
     """Read a recording and return what would be understood of it, a table's columns included; nothing is stored."""
-    return say(recordings.preview(upload.read_as(asked.said), read))
+    return say(recordings.preview(upload.read_as(asked), parse))
 
 
 @router.get("/recordings", dependencies=[needs("reader")], **gives_page(Page[RecordingSummary], 410))
@@ -73,7 +73,7 @@ def list_recordings(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor =
     """List recordings, the newest first."""
     with db.reading() as session:
         found = overview.newest_recordings(session, cursor, limit)
-        written = [recordings.summary_json(row, cut) for row, cut in found]
+        written = [recordings.summarise_recording(row, cut) for row, cut in found]
         return give.page(written, limit, found[-1][0].row if found else None)
 
 
@@ -81,7 +81,7 @@ def list_recordings(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor =
 def get_recording(recording: Digest, db: Db, give: Giving) -> Response:
     """Return a recording."""
     with db.reading() as session:
-        return give(recording_json(recordings.find_recording(session, recording)))
+        return give(describe_recording(recordings.find_recording(session, recording)))
 
 
 @router.delete("/recordings/{recording}", dependencies=[needs("uploader")], **ends(404, 409))
@@ -121,7 +121,7 @@ def list_proposals(
     asked = {"recording": recording, "surgeon": surgeon, "suture": suture}
     with db.reading() as session:
         found, following = proposals.list_proposals(session, limit, cursor, state=state, **asked)
-        return give.page([proposal_json(one) for one in found], len(found), following)
+        return give.page([describe_proposal(one) for one in found], len(found), following)
 
 
 @router.put("/recordings/{recording}/proposals/{number}", dependencies=[needs("uploader")], **says(Proposal, 404, 409))
@@ -130,7 +130,7 @@ def decide_proposal(recording: Digest, number: Number, body: ProposalIn, db: Db,
     with db.reading() as session:
         recording = find_recording(session, recording).sha256  # in full: the argument may be a prefix
     with db.writing([locks.recording(recording)]) as session:
-        return say(proposal_json(proposals.decide(session, recording, number, body.state, body.note, actor)))
+        return say(describe_proposal(proposals.decide(session, recording, number, body.state, body.note, actor)))
 
 
 @page_router.get("/pages/proposals", dependencies=[needs("reader")])
@@ -161,6 +161,6 @@ def show_proposals(
 
 
 @page_router.get("/pages/recordings/{recording}/proposals", dependencies=[needs("reader")])
-def draw_proposals(recording: Digest, caller: Asking, db: Db, tell: Tell) -> Response:
+def draw_proposals(recording: Digest, caller: Asking, db: Db, parse: Parse) -> Response:
     """Return the paths of the tip in all proposals of a recording, for their small pictures."""
-    return say({"paths_mm": proposals.paths_of(db, recording, tell)}, headers={"Cache-Control": "no-store"})
+    return say({"paths_mm": proposals.paths_of(db, recording, parse)}, headers={"Cache-Control": "no-store"})

@@ -21,13 +21,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import prod
 from pathlib import PurePosixPath
-from typing import Any, BinaryIO, Protocol
+from typing import Annotated, Any, BinaryIO, Protocol
 
-from skills.errors import UnreadableRecording
-from skills.formats.archive import shown
-from skills.formats.lerobot.parquet import ParquetColumn, open_parquet, printable, read_rows
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-INFO, SAID, TASK_LINES, TASK_TABLE = (
+from skills.errors import BadColumns, UnreadableRecording
+from skills.formats.archive import printable, shown
+from skills.formats.lerobot.parquet import ParquetColumn, open_parquet, read_rows
+
+INFO, STATEMENTS, TASK_LINES, TASK_TABLE = (
     *("meta/info.json", "meta/suture-skills.json"),
     *("meta/tasks.jsonl", "meta/tasks.parquet"),
 )
@@ -54,6 +56,24 @@ class Files(Protocol):
 
     def unpacked(self, name: str) -> AbstractContextManager[BinaryIO]:
         """Open a file."""
+
+
+class Statements(BaseModel):
+    """The contents of our own file, which states what a dataset does not.
+
+    Attributes:
+        columns: Our names of columns, and the dataset's.
+        tools: Arms, and the numbers of their instruments.
+        frames: Arms, and the frames of their poses.
+        cut_from: The version of the dataset from which an episode was cut, where it was another one.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    columns: Annotated[dict[str, str], Field(max_length=NUMBERS)] = {}
+    tools: Annotated[dict[str, str], Field(max_length=NUMBERS)] = {}
+    frames: dict[str, Annotated[str, Field(pattern=r"^[A-Za-z0-9_./-]{1,64}$")]] = {}
+    cut_from: str | None = None
 
 
 @dataclass(frozen=True)
@@ -114,10 +134,18 @@ class Dataset:
         return self.parquets("data/")
 
     @cached_property
-    def said(self) -> Json:
-        """The contents of our own file; empty without one."""
-        name = self.root + SAID
-        return _object(self.files, name) if name in self.files.names else {}
+    def statements(self) -> Statements:
+        """The contents of our own file; empty without one.
+
+        Raises:
+            BadColumns: A statement has another form.
+        """
+        name = self.root + STATEMENTS
+        try:
+            return Statements.model_validate(_object(self.files, name) if name in self.files.names else {})
+        except ValidationError as error:
+            field = printable(".".join(map(str, error.errors()[0]["loc"])))
+            raise BadColumns(f"`{field}` in {STATEMENTS} is not an object of our names and the dataset's.") from error
 
     @cached_property
     def tasks(self) -> dict[int, str]:
@@ -183,11 +211,11 @@ def read_dataset(files: Files, root: str) -> Dataset:
     version, fps, features = info.get("codebase_version"), info.get("fps"), info.get("features")
     if version not in VERSIONS:
         raise UnreadableRecording(
-            f"The codebase_version of the dataset is {printable(version)}; {', '.join(VERSIONS)} are read. Convert it "
-            "with LeRobot."
+            f"The codebase_version of the dataset is {printable(version)!r}; {', '.join(VERSIONS)} are read. Convert "
+            "it with LeRobot."
         )
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= FASTEST_HZ:
-        raise UnreadableRecording(f"The fps of the dataset is {printable(fps)}; give a rate, up to {FASTEST_HZ:g}.")
+        raise UnreadableRecording(f"The fps of the dataset is {printable(fps)!r}; give a rate, up to {FASTEST_HZ:g}.")
     if not isinstance(features, dict):
         raise UnreadableRecording(f"{INFO} has no features.")
     read = tuple(_feature(name, one) for name, one in features.items())
@@ -210,7 +238,7 @@ def _feature(name: str, described: Any) -> Feature:
             raise ValueError(name)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UnreadableRecording(
-            f"The feature {printable(name)} in {INFO} has no dtype, no shape of up to {NUMBERS} numbers, or not as "
+            f"The feature {printable(name)!r} in {INFO} has no dtype, no shape of up to {NUMBERS} numbers, or not as "
             "many names as numbers."
         ) from error
     return Feature(name, dtype, width, flat)

@@ -19,7 +19,7 @@ from typing import IO, Any, BinaryIO
 
 from skills.errors import BadInput, UnreadableRecording
 from skills.formats.archive import MAGIC, Archive, pack, refusing
-from skills.formats.lerobot import INFO, SAID, TASK_LINES, Dataset, Json, read_dataset, root_of
+from skills.formats.lerobot import INFO, STATEMENTS, TASK_LINES, Dataset, Json, read_dataset, root_of
 from skills.formats.lerobot.episode import several_episodes
 from skills.formats.lerobot.parquet import open_parquet, read_rows
 
@@ -161,12 +161,12 @@ def cut_episode(
     members[TASK_LINES] = b"\n".join(map(_json, named))
     about = {"episode_index": number, "tasks": [one["task"] for one in named], "length": rows.num_rows}
     members["meta/episodes.jsonl"] = _json(about)
-    said = dict(dataset.said)
-    for name, stated in (("columns", columns), ("tools", tools)):
-        said |= {name: {**said.get(name, {}), **stated}} if stated else {}
-    if dataset.version == "v3.0":
-        said["cut from"] = dataset.version
-    members |= {SAID: _json(said)} if said else {}
+    before = dataset.statements
+    changes = {"columns": {**before.columns, **columns}} if columns else {}
+    changes |= {"tools": {**before.tools, **tools}} if tools else {}
+    version = {"cut_from": dataset.version} if dataset.version == "v3.0" else {}
+    if statements := before.model_dump(exclude_unset=True) | changes | version:
+        members[STATEMENTS] = _json(statements)
     pack({name: io.BytesIO(data) for name, data in sorted(members.items())}, out)
 
 

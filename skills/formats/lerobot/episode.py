@@ -31,6 +31,7 @@ import numpy as np
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic
 from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
+from skills.formats.archive import printable
 from skills.formats.columns import (
     BASE,
     POSE_PARTS,
@@ -45,8 +46,8 @@ from skills.formats.columns import (
     setpoints_in,
     topic_of,
 )
-from skills.formats.lerobot import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
-from skills.formats.lerobot.parquet import ParquetTable, printable, read_columns
+from skills.formats.lerobot import INFO, STATEMENTS, VERSIONS, Dataset, Feature, Files, read_dataset
+from skills.formats.lerobot.parquet import ParquetTable, read_columns
 from skills.kinematics import INSTRUMENTS
 from skills.remedies import Action, Remedy, did_you_mean
 
@@ -67,7 +68,6 @@ _JOINT = re.compile(
 _JAW = re.compile(r"(?:observation\.state\.)?(psm\d{1,2})[._](?:jaw|gripper)(_sp|_setpoint)?", re.I)
 _TOOL = re.compile(r"(?:observation\.meta\.tool\.)?(psm\d{1,2})(?:_tool_type)?", re.I)
 _NUMBER = re.compile(r"(?:^|:)(\d+)(?:\[|$)")  # of "LARGE_NEEDLE_DRIVER:400006[..11]", or alone
-_FRAME = re.compile(r"[A-Za-z0-9_./-]{1,64}")
 _JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 _SCALARS = ("timestamp", "frame_index", "episode_index", "task_index")
 _SEC, _NANOSEC = "observation.meta.ros_time_sec", "observation.meta.ros_time_nsec"
@@ -230,7 +230,7 @@ def _meanings(
             elif meaning not in stated and place not in taken:
                 arm, kind, component = meaning
                 if found.setdefault((arm, kind), {}).setdefault(component, place) != place:
-                    double = f"Two columns of the dataset are called {printable(names[0])}."
+                    double = f"Two columns of the dataset are called {printable(names[0])!r}."
                     if kind not in SETPOINTS:
                         raise BadColumns(double, Remedy(Action.NAME_FEATURES))
                     faults[arm, kind] = double
@@ -244,17 +244,12 @@ def _meanings(
     faults |= {quantity: why for quantity, places in commanded.items() if (why := _incomplete(quantity, places))}
     unknown += [(topic_of(*quantity), why) for quantity, why in faults.items()]
     if not any(kind != "jaw" for _, kind in measured):
-        listed = ", ".join(name for one in numeric for name in one.names or [one.name])[:1000]
+        listed = ", ".join(name for one in numeric for name in one.names or [one.name]) or "no named columns"
         raise NoUsableTopic(
-            f"No column of the dataset is known as a pose or the joints of a PSM. It has {printable_list(listed)}.",
+            f"No column of the dataset is known as a pose or the joints of a PSM. It has {printable(listed, 1000)}.",
             Remedy(Action.NAME_FEATURES),
         )
     return measured, {one: places for one, places in commanded.items() if one not in faults}, unknown
-
-
-def printable_list(text: str) -> str:
-    """Return a list of names of a file as it may appear in a message."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text) or "no named columns"
 
 
 def meaning_of(name: str) -> tuple[str, str, int] | None:
@@ -272,21 +267,20 @@ def meaning_of(name: str) -> tuple[str, str, int] | None:
 
 def _stated(dataset: Dataset, numeric: Sequence[Feature]) -> dict[tuple[str, str, int], Place]:
     """Return the columns that `columns` of our own file names, by meaning."""
-    said = dataset.said.get("columns", {})
-    if not isinstance(said, dict) or len(said) > NUMBERS:
-        raise BadColumns(f"`columns` in {SAID} is not an object of our names and the dataset's.")
     places = {name: (one.name, k) for one in numeric for k in range(one.width) for name in reversed(one.called(k))}
     stated = {}
-    for ours, theirs in said.items():
+    for ours, theirs in dataset.statements.columns.items():
         meaning = meaning_of(ours)
         if meaning is None:
-            raise BadColumns(f"{printable(ours)} is no column of ours; psm1_pose.position.x and psm1_joint_1 are two.")
-        if not isinstance(theirs, str) or theirs not in places:
-            near = did_you_mean(str(theirs)[:80], [name for name in places if len(name) <= 80][:300])
-            raise BadColumns(f"The dataset has no column {printable(theirs)}.", *near)
+            raise BadColumns(
+                f"{printable(ours)!r} is no column of ours; psm1_pose.position.x and psm1_joint_1 are two."
+            )
+        if theirs not in places:
+            near = did_you_mean(theirs[:80], [name for name in places if len(name) <= 80][:300])
+            raise BadColumns(f"The dataset has no column {printable(theirs)!r}.", *near)
         stated[meaning] = places[theirs]
     if len(set(stated.values())) < len(stated):
-        raise BadColumns(f"`columns` in {SAID} gives two meanings to one column.")
+        raise BadColumns(f"`columns` in {STATEMENTS} gives two meanings to one column.")
     return stated
 
 
@@ -355,10 +349,7 @@ def _frames(dataset: Dataset, frame: str | None, arms: Collection[str]) -> dict[
         BadColumns: Our own file is not valid.
         MixedFrames: The stated frame is another than in our own file.
     """
-    said = dataset.said.get("frames", {})
-    if not isinstance(said, dict) or not all(isinstance(one, str) and _FRAME.fullmatch(one) for one in said.values()):
-        raise BadColumns(f"`frames` in {SAID} is not an object of arms and their frames.")
-    frames = {arm: said[arm] for arm in arms if arm in said}
+    frames = {arm: named for arm, named in dataset.statements.frames.items() if arm in arms}
     stated = {} if frame is None else {arm: f"{arm}_base" if frame == BASE else frame for arm in arms}
     wrong = sorted(arm for arm in frames if stated.get(arm, frames[arm]) != frames[arm])
     if wrong:
@@ -390,17 +381,14 @@ def _tools(dataset: Dataset, table: ParquetTable) -> dict[str, str]:
                 raise UnreadableRecording(f"The tool of {arm} changes within the episode; cut it there.")
             name = next(iter(names))[:NOTE_CHARACTERS]
             tools |= {arm: name} if arm is not None and name else {}
-    said = dataset.said.get("tools", {})
-    if not isinstance(said, dict) or len(said) > NUMBERS:
-        raise BadColumns(f"`tools` in {SAID} is not an object of arms and their instruments.")
-    for arm, tool in said.items():
-        number, found = _number(str(tool)), _number(tools.get(arm, ""))
+    for arm, tool in dataset.statements.tools.items():
+        number, found = _number(tool), _number(tools.get(arm, ""))
         if number is None or not re.fullmatch(r"PSM\d{1,2}", arm):
             known = ", ".join(INSTRUMENTS)
-            raise BadColumns(f"{printable(tool)} is no known instrument of {printable(arm)}; known are {known}.")
+            raise BadColumns(f"{printable(tool)!r} is no known instrument of {printable(arm)!r}; known are {known}.")
         if found not in (None, number):
             raise BadColumns(f"The instrument of {arm} was stated as {number}, and the dataset names {found}.")
-        tools[arm] = str(tool)[:NOTE_CHARACTERS]
+        tools[arm] = tool[:NOTE_CHARACTERS]
     return tools
 
 
@@ -412,7 +400,7 @@ def _number(tool: str) -> str | None:
 
 def _notes(dataset: Dataset, table: ParquetTable) -> list[tuple[str, str]]:
     """Return the version, the robot, the episode's number and split, and its tasks."""
-    version = dataset.said.get("cut from", dataset.version)
+    version = dataset.statements.cut_from
     notes = [("dataset", f"LeRobot {version if version in VERSIONS else dataset.version}")]
     if isinstance(robot := dataset.info.get("robot_type"), str):
         notes.append(("robot", robot[:NOTE_CHARACTERS]))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from skills.arrays import Floats
 from skills.errors import UnreadableRecording
-from skills.formats.archive import FREE_BYTES, RATIO, refusing
+from skills.formats.archive import FREE_BYTES, RATIO, printable, refusing
 
 ROWS = 1_000_000  # nine hours at 30 Hz
 FOOTER_BYTES = 16 << 20  # 2000 episodes of 50 columns in one file have 8 MB
@@ -171,7 +171,7 @@ def _named_rows(opened: Any, wanted: Collection[str], most_rows: int) -> int:
     names = list(opened.schema_arrow.names)
     missing = [name for name in wanted if names.count(name) != 1]
     if missing:
-        raise UnreadableRecording(f"{_WHAT} has the column {printable(missing[0])} {names.count(missing[0])} times.")
+        raise UnreadableRecording(f"{_WHAT} has the column {printable(missing[0])!r} {names.count(missing[0])} times.")
     rows = int(opened.metadata.num_rows)
     if rows > most_rows:
         raise UnreadableRecording(f"{_WHAT} has {rows} rows; at most {most_rows} are read. Cut it.")
@@ -214,11 +214,6 @@ def _flat(values: Any, column: ParquetColumn) -> Any:
     if not whole or not typed or values.null_count or len(values) != rows * column.width:
         what = "texts" if column.is_text else "numbers"
         raise UnreadableRecording(
-            f"{_WHAT}: the column {printable(column.name)} does not have {column.width} {what} in every row."
+            f"{_WHAT}: the column {printable(column.name)!r} does not have {column.width} {what} in every row."
         )
     return values
-
-
-def printable(value: object) -> str:
-    """Return text of a file as it may appear in a message: quoted, printable, at most 80 characters."""
-    return repr("".join(letter if letter.isprintable() else "?" for letter in str(value)[:80]))

@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 
 from skills.errors import BadInput, Corrupt
-from skills.formats.archive import Archive
+from skills.formats.archive import Archive, printable
 from skills.formats.checksums import SUMS, digest_of, read_sums, write_sums
 from skills.formats.lerobot import INFO, Dataset, Json
 from skills.formats.lerobot.cut import EPISODES, Episode, cut_episode, episodes_of, find_dataset
 from skills.formats.lerobot.episode import episode_stamps
-from skills.formats.lerobot.parquet import open_parquet, printable, read_rows
+from skills.formats.lerobot.parquet import open_parquet, read_rows
 from skills.formats.lerobot.writer import CHUNK, NO_PICTURES, joined_stats
 from skills.formats.mp4 import Mp4, read_mp4
 
@@ -170,7 +170,9 @@ def _cameras(folder: Path, dataset: Dataset) -> list[str]:
         raise BadInput(f"{folder} has no videos: {INFO} describes no feature of the dtype video.")
     for name in names:
         if not (_CAMERA.fullmatch(name) and len(name) <= _CAMERA_LETTERS):
-            raise BadInput(f"{folder} has a camera called {printable(name)}; its name must have letters, digits, . _ -")
+            raise BadInput(
+                f"{folder} has a camera called {printable(name)!r}; its name must have letters, digits, . _ -"
+            )
     return names
 
 
@@ -211,7 +213,7 @@ def choose_videos(recordings: Sequence[str], sources: Mapping[str, EpisodeSource
             videos.stats[camera] = [one for one in stats if one is not None]
     _read_headers(videos)
     _describe(videos, [found[source.folder].said for source in chosen])
-    _refuse_strangers(videos, version)
+    _refuse_other_frames(videos, version)
     return videos
 
 
@@ -351,8 +353,9 @@ def _describe(videos: Videos, said: Sequence[Mapping[str, tuple[str | None, bool
             feature = _feature(header, pixels, is_depth, videos.fps)
             if videos.cameras.setdefault(camera, feature) != feature:
                 raise BadInput(
-                    f"{camera} is {_in_words(feature)} in {clip.file}, and {_in_words(videos.cameras[camera])} in the "
-                    "episodes before; export those that are equal, by --demo."
+                    f"{camera} is {_describe_camera(feature)} in {clip.file}, and "
+                    f"{_describe_camera(videos.cameras[camera])} in the episodes before; export those that are equal, "
+                    "by --demo."
                 )
 
 
@@ -372,13 +375,13 @@ def _feature(header: Mp4, pixels: str | None, is_depth: bool, fps: float) -> Jso
     return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": info}
 
 
-def _in_words(feature: Json) -> str:
+def _describe_camera(feature: Json) -> str:
     info = feature["info"]
     kind = "depth" if info["video.is_depth_map"] else info.get("video.pix_fmt", "unknown pixels")
     return f"{info['video.codec']}, {info['video.width']} x {info['video.height']}, {kind}"
 
 
-def _refuse_strangers(videos: Videos, version: str) -> None:
+def _refuse_other_frames(videos: Videos, version: str) -> None:
     """Refuse a file with frames that are of no exported episode, or for v2.1 of several episodes."""
     for path, header in videos.headers.items():
         clips = sorted((c for one in videos.clips for c in one.values() if c.file == path), key=lambda clip: clip.first)
@@ -427,7 +430,7 @@ def add_videos(folder: Path, videos: Videos) -> None:
 
 
 def _words(videos: Videos) -> str:
-    cameras = "".join(f"- `{name}`: {_in_words(one)}\n" for name, one in videos.cameras.items())
+    cameras = "".join(f"- `{name}`: {_describe_camera(one)}\n" for name, one in videos.cameras.items())
     return f"""Cameras:
 
 {cameras}

@@ -35,7 +35,7 @@ from skills.demonstration.recording import Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
 from skills.formats.checksums import SUMS, digest_of, write_sums
 from skills.formats.columns import POSE_PARTS
-from skills.formats.lerobot import INFO, SAID, TASK_LINES, TASK_TABLE, Json
+from skills.formats.lerobot import INFO, STATEMENTS, TASK_LINES, TASK_TABLE, Json
 
 Version = Literal["v2.1", "v3.0"]
 ActionRule = Literal["next state", "setpoint"]
@@ -189,15 +189,15 @@ def _files(
     total = _Total(about)
     with store:
         for episode in episodes:
-            taken = total.take(episode)
-            yield from store.write(taken)
+            added = total.take(episode)
+            yield from store.write(added)
         if not total.episodes:
             raise BadInput("There are no episodes to write.")
         yield from store.finish(total)
     info = total.info(version)
     yield INFO, _json(info)
     yield (
-        SAID,
+        STATEMENTS,
         _json(
             {"action": about.action, "frames": total.frames}
             | ({} if about.export is None else {"export": about.export})
@@ -208,7 +208,7 @@ def _files(
 
 
 @dataclass(frozen=True, eq=False)
-class _Taken:
+class _EpisodeColumns:
     """An episode as columns, with its statistics."""
 
     number: int
@@ -236,7 +236,7 @@ class _Total:
     widths: dict[str, int] = field(default_factory=dict)  # of the columns with statistics, in their order
     numbers: dict[str, list[float]] = field(default_factory=dict)  # the statistics of all columns, one after another
 
-    def take(self, episode: ExportedEpisode) -> _Taken:
+    def take(self, episode: ExportedEpisode) -> _EpisodeColumns:
         """Return an episode as columns, and add it."""
         self._add_to_split(episode.split)
         state, stamps_ns = self.sampled(episode)
@@ -260,9 +260,9 @@ class _Total:
         numbers = _stats_of(np.concatenate([*wide.values()], axis=1, dtype=np.float64))
         self.widths = {name: one.shape[1] for name, one in wide.items()}
         self.numbers = joined_stats(self.numbers, numbers) if number else numbers
-        taken = _Taken(number, (episode.task,), task, self.rows, columns, _by_column(numbers, self.widths))
+        added = _EpisodeColumns(number, (episode.task,), task, self.rows, columns, _by_column(numbers, self.widths))
         self.episodes, self.rows = number + 1, self.rows + rows
-        return taken
+        return added
 
     def _add_to_split(self, split: Split) -> None:
         if any(SPLITS.index(before) > SPLITS.index(split) for before in self.splits):
@@ -460,17 +460,17 @@ class _SingleFiles:
         self._episodes.close()
         self._stats.close()
 
-    def write(self, taken: _Taken) -> Iterator[tuple[str, IO[bytes]]]:
+    def write(self, added: _EpisodeColumns) -> Iterator[tuple[str, IO[bytes]]]:
         """Yield the file of an episode."""
         from pyarrow import parquet
 
         with io.BytesIO() as file:
-            parquet.write_table(_table(taken), file)
-            yield _V21_DATA.format(episode_chunk=taken.number // CHUNK, episode_index=taken.number), file
-        about = {"episode_index": taken.number, "tasks": taken.tasks, "length": taken.rows}
-        plain = {name: {key: one[key] for key in one if key not in QUANTILES} for name, one in taken.stats.items()}
+            parquet.write_table(_table(added), file)
+            yield _V21_DATA.format(episode_chunk=added.number // CHUNK, episode_index=added.number), file
+        about = {"episode_index": added.number, "tasks": added.tasks, "length": added.rows}
+        plain = {name: {key: one[key] for key in one if key not in QUANTILES} for name, one in added.stats.items()}
         self._episodes.write(_line(about))
-        self._stats.write(_line({"episode_index": taken.number, "stats": plain}))
+        self._stats.write(_line({"episode_index": added.number, "stats": plain}))
 
     def finish(self, total: _Total) -> Iterator[tuple[str, IO[bytes]]]:
         """Yield the files about all episodes."""
@@ -495,30 +495,30 @@ class _SharedFiles:
         self._data.close()
         self._table.close()
 
-    def write(self, taken: _Taken) -> Iterator[tuple[str, IO[bytes]]]:
+    def write(self, added: _EpisodeColumns) -> Iterator[tuple[str, IO[bytes]]]:
         """Add an episode; yield the data file that is full."""
         from pyarrow import parquet
 
-        table = _table(taken)
+        table = _table(added)
         full = self._bytes + table.nbytes > FILE_BYTES or self._episodes == FILE_EPISODES
         if self._writer is not None and full:
             yield from self._finished_file()
         if self._writer is None:
             self._writer = parquet.ParquetWriter(self._data, table.schema)
-        self._writer.write_table(table, row_group_size=max(1, taken.rows))
+        self._writer.write_table(table, row_group_size=max(1, added.rows))
         self._bytes, self._episodes = self._bytes + table.nbytes, self._episodes + 1
         place = {
-            "episode_index": taken.number,
-            "tasks": list(taken.tasks),
-            "length": taken.rows,
+            "episode_index": added.number,
+            "tasks": list(added.tasks),
+            "length": added.rows,
             "data/chunk_index": self._file // CHUNK,
             "data/file_index": self._file % CHUNK,
-            "dataset_from_index": taken.first,
-            "dataset_to_index": taken.first + taken.rows,
+            "dataset_from_index": added.first,
+            "dataset_to_index": added.first + added.rows,
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
-        stats = {f"stats/{name}/{key}": one for name, found in taken.stats.items() for key, one in found.items()}
+        stats = {f"stats/{name}/{key}": one for name, found in added.stats.items() for key, one in found.items()}
         self._waiting.append(place | stats)
         if len(self._waiting) == TABLE_ROWS:
             self._write_places()
@@ -575,12 +575,12 @@ _TASKS_FOR_PANDAS = json.dumps(
 )
 
 
-def _table(taken: _Taken) -> Any:
+def _table(added: _EpisodeColumns) -> Any:
     """Return an episode as pyarrow's table."""
     import pyarrow as pa
 
     arrays = {}
-    for name, column in taken.columns.items():
+    for name, column in added.columns.items():
         if isinstance(column, np.ndarray) and column.ndim == 2:
             arrays[name] = pa.FixedSizeListArray.from_arrays(pa.array(column.ravel()), column.shape[1])
         else:

@@ -124,9 +124,9 @@ class _Log:
             channel = self.walker.channels[number]
             if (decoder := self._decoder_of(channel)) is None:
                 continue
-            topic, messages = self.topics[channel.topic], part.of(channel)
+            topic = self.topics[channel.topic]
             try:
-                topic.columns.append(decoder.decode(messages.data, messages.begin, messages.length))
+                topic.columns.append(decoder.decode(part.data, *part.of(number)))
             except SkillsError as error:
                 self.leave_out(topic, error)
 

@@ -68,11 +68,11 @@ def take(
     messages: Any,  # (N,) int64: the byte at which each message begins
     lengths: Any,  # (N,) int64: of its content
     size: int,  # the length of the content in this shape
-    looks: int,  # the number of words, the first ones, that are only compared
+    compared: int,  # the number of words, the first ones, that are only compared
     places: Any,  # (M,) uint64: offset of each word in a message, in bytes
     masks: Any,  # (M,) uint64: its bits that identify the shape
     marked: Any,  # (M,) uint64: the values of these bits
-    taken: Any,  # (N, M - looks) uint64, output: the other words of each message that has the shape
+    taken: Any,  # (N, M - compared) uint64, output: the other words of each message that has the shape
     fits: Any,  # (N,) bool, output: whether each message has the shape
 ) -> Any:
     """Copy words from every message that has the length and the marked bits of a shape; return how many have."""
@@ -83,13 +83,13 @@ def take(
         first = np.uint64(messages[n])
         same = lengths[n] == size and first <= end and end - first >= reach
         k = 0
-        while same and k < looks:
+        while same and k < compared:
             same = word(data, first + places[k]) & masks[k] == marked[k]
             k += 1
         fits[n] = same
         if same:
-            for k in range(looks, len(places)):
-                taken[found, k - looks] = word(data, first + places[k])
+            for k in range(compared, len(places)):
+                taken[found, k - compared] = word(data, first + places[k])
             found += 1
     return found
 

@@ -86,7 +86,9 @@ def fields_of(name: str, definition: str) -> tuple[Field, ...]:
         if (said := _NAME.match(head)) is None:
             raise UnreadableRecording(f"The definition of {name} has a part without a name.")
         parts[_short(said[1])] = lines
-    return tuple(_flat(parts, _short(name)))
+    fields: list[Field] = []
+    _add_fields(fields, parts, _short(name), prefix="", depth=0)
+    return tuple(fields)
 
 
 def _lines(part: str) -> list[str]:
@@ -99,13 +101,6 @@ def _short(name: str) -> str:
     """Normalise "geometry_msgs/msg/Pose" and "geometry_msgs/Pose" to the latter."""
     package, *_, own = name.split("/") if "/" in name else ("", name)
     return f"{package}/{own}"
-
-
-def _flat(parts: dict[str, list[str]], name: str) -> list[Field]:
-    """Return the fields of a message in order, with those of nested messages in place."""
-    fields: list[Field] = []
-    _add_fields(fields, parts, name, prefix="", depth=0)
-    return fields
 
 
 def _add_fields(fields: list[Field], parts: dict[str, list[str]], name: str, *, prefix: str, depth: int) -> None:
@@ -193,8 +188,8 @@ class Shape:
 
     Attributes:
         size: Bytes of a message's content.
-        looks: M, the number of words, at the beginning, that are only compared: they contain the byte order, a length
-            or the text.
+        compared: M, the number of words, at the beginning, that are only compared: they contain the byte order, a
+            length or the text.
         places: Positions of these, then of the W words that contain the log time and the wanted numbers, shape (M +
             W,).
         masks: The bits of each word that are equal in all messages of this shape, shape (M + W,).
@@ -205,7 +200,7 @@ class Shape:
     """
 
     size: int
-    looks: int
+    compared: int
     places: NDArray[np.uint64]
     masks: NDArray[np.uint64]
     marked: NDArray[np.uint64]
@@ -251,9 +246,9 @@ def take(data: Bytes, messages: Ints, lengths: Ints, shape: Shape) -> tuple[Flag
     Returns:
         Which messages have the shape, shape (N,), and the words of these, shape (K, W).
     """
-    taken = np.empty((len(messages), len(shape.places) - shape.looks), np.uint64)
+    taken = np.empty((len(messages), len(shape.places) - shape.compared), np.uint64)
     fits = np.empty(len(messages), np.bool_)
-    of_shape = (shape.size, shape.looks, shape.places, shape.masks, shape.marked)
+    of_shape = (shape.size, shape.compared, shape.places, shape.masks, shape.marked)
     found = _kernels.take_compiled(looked_at(data), messages, lengths, *of_shape, taken, fits)
     return fits, taken[: int(found)]
 
@@ -286,15 +281,15 @@ def shape_of(message: bytes, fields: Sequence[Field], wanted: Wanted, topic: str
     mask[cursor.marks] = 0xFF
     mask[max([*ends, cursor.text_ends, _ENCAPSULATION_BYTES]) :] = 0  # later bytes may differ between messages
     bits, first = mask.view("<u8"), np.frombuffer(message.ljust(len(mask), b"\0"), "<u8")
-    looks = np.flatnonzero(bits)
+    compared = np.flatnonzero(bits)
     places, runs = _places(numbers)
     nothing = np.zeros(len(places), np.uint64)
     return Shape(
         size=len(message),
-        looks=len(looks),
-        places=np.concatenate([HEAD_BYTES + _WORD_BYTES * looks, places]).astype(np.uint64),
-        masks=np.concatenate([bits[looks], nothing]),
-        marked=np.concatenate([(first & bits)[looks], nothing]),
+        compared=len(compared),
+        places=np.concatenate([HEAD_BYTES + _WORD_BYTES * compared, places]).astype(np.uint64),
+        masks=np.concatenate([bits[compared], nothing]),
+        marked=np.concatenate([(first & bits)[compared], nothing]),
         stamp=runs[: len(stamp)],
         runs=runs[len(stamp) :],
         text=text,

@@ -1,6 +1,6 @@
 """The MCAP reader: one sequential pass over the records of a file, which trusts none of the file's claims about itself.
 
-    file --Walker.stretches--> Stretch: the messages of one channel in some MiB of the file
+    file --Walker.parts--> Part: some MiB of the file --of--> the messages of one channel
 
 Every record must end where its header says, every checksum present must be correct, the data section and the summary
 must be complete, and the file's statistics must agree with the records found. Indexes are skipped and never used.
@@ -81,23 +81,6 @@ class Channel:
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
-    """Some messages of one channel, in the order of the file; its bytes are valid until the walk continues.
-
-    Attributes:
-        channel: Their channel.
-        data: Decompressed bytes of the file, shape (B,), followed by 8 bytes that are not from the file.
-        begin: Position of each content in `data`, shape (N,); a message's header of 31 bytes precedes it.
-        length: Length of each content in bytes, shape (N,).
-    """
-
-    channel: Channel
-    data: Bytes
-    begin: Ints
-    length: Ints
-
-
-@dataclass(frozen=True, eq=False)
 class Part:
     """Some MiB of records; its bytes are valid until the walk continues.
 
@@ -117,11 +100,15 @@ class Part:
         numbers: list[int] = np.flatnonzero(self.chain.counts).tolist()
         return numbers
 
-    def of(self, channel: Channel) -> Stretch:
-        """Return the messages of a channel that has some here."""
-        which = self.chain.of(channel.number)
-        contents = self.chain.messages[which] + (HEAD.size + MESSAGE.size)
-        return Stretch(channel, self.data, contents, self.chain.lengths[which])
+    def of(self, number: int) -> tuple[Ints, Ints]:
+        """Return the messages of a channel that has some here, in the order of the file.
+
+        Returns:
+            Position of each content in `data`, shape (N,), which a header of 31 bytes precedes, and its length in
+            bytes, shape (N,).
+        """
+        which = self.chain.of(number)
+        return self.chain.messages[which] + (HEAD.size + MESSAGE.size), self.chain.lengths[which]
 
 
 class Walker:
@@ -160,17 +147,12 @@ class Walker:
             return "full"
         return "partial" if self._with_checksum else "none"
 
-    def stretches(self) -> Iterator[Stretch]:
-        """Walk over the file, and yield the messages of each part, channel by channel.
+    def parts(self) -> Iterator[Part]:
+        """Walk over the file, and yield its parts.
 
         Raises:
             UnreadableRecording: Truncated, corrupt, incomplete, or over a limit.
         """
-        for part in self.parts():
-            yield from (part.of(self.channels[number]) for number in part.numbers)
-
-    def parts(self) -> Iterator[Part]:
-        """Walk over the file, and yield its parts; errors are those of `stretches`."""
         self._begin()
         for part in self._parts():
             self._take(part)

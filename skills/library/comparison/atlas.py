@@ -3,70 +3,46 @@
     Database --atlas_of--> Atlas
 
 An atlas compares all active demonstrations of the suture type whose surgeon's consent covers it; of more than `MOST`, a
-sample. Of overlapping cuts of one motion the newest counts.
-
-A pair is measured at the first request that contains both demonstrations, so a new demonstration costs one row of
-distances. The results are stored in one row for each demonstration (`MeasuredShape`), in short transactions during the
-measuring, so that an interruption loses little work. Both kinds of distances are stored, in mm and scaled: an atlas
-uses one or the other.
+sample. Of overlapping cuts of one motion the newest counts. It uses distances in mm, or scaled ones.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from threading import Lock
 
 import numpy as np
-from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, delete, func, insert, select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from skills.arrays import Floats, Ints
 from skills.comparison.distances import (
     LEAST_MM,
     STATES,
-    VERSION,
     WORTH,
     Dendrogram,
     Difference,
-    Measured,
     chart,
     dendrogram,
     difference,
-    distances_of,
     how_many,
     in_lengths,
     medoid,
-    shape_of,
     silhouette,
     spread,
 )
-from skills.comparison.recognition import NUMBERS, signature_of
-from skills.db import in_parts
-from skills.db.models import Demonstration, MeasuredShape, SutureType
-from skills.db.packed import pack
-from skills.db.row_visibility import ALL_ROWS
+from skills.db.models import Demonstration, SutureType
 from skills.db.session import Database
-from skills.demonstration.demonstration import Demo
-from skills.errors import BadPath, Busy, Conflict, NotFound
+from skills.errors import BadPath, Conflict, NotFound
+from skills.library.comparison.measured import far_apart
 from skills.library.comparison.members import Member, members_of, sessions_of, without_overlaps
-from skills.library.comparison.recognition import recognise_arms, recognitions, votes, whose
-from skills.library.operation import locks
-from skills.library.people.catalogue import find_suture_type
+from skills.library.comparison.recognition import recognise_arms, recognise_demo, recognitions, votes
 from skills.library.people.consent import require
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import shares_served
 from skills.library.recordings.demos import find_demo
-from skills.schemas.comparison import Apartness, Atlas, Cluster, Consistency, LeftOutOfAtlas, Merge, OfSurgeon, Place
+from skills.schemas import comparison as described
 
-DEMOS_AT_ONCE = 100  # recorded motions in memory; each has some thousand samples
-PAIRS_AT_ONCE = 20_000  # measured between two transactions: about a second
-PATIENCE_S = 30.0  # timeout of the wait for another thread's measuring; 1000 demonstrations take about as long
-
-_measuring = Lock()  # two requests at once would measure the same pairs twice
-
-Kept = dict[int, Measured]  # by the demonstration's row
 MOST = 2000  # demonstrations shown: a minute of measuring on two cores, once, and a response of 16 MB
 MOST_COMPARED = 40  # surgeons; all pairs of them are compared, in half a second
 DIGITS = 4  # of the rounded results: a tenth of a micrometre, far below the resolution of a recorder
@@ -96,192 +72,9 @@ SESSIONS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Apart:
-    """Shapes, and the distances between all of them.
-
-    Attributes:
-        rows: Rows of the demonstrations that have a shape, increasing, shape (N,).
-        shapes_mm: Shape (N, STATES, 3).
-        apart_mm: DTW totals in mm, shape (N, N); NaN for pairs that were not measured yet.
-        apart_scaled: The same for scaled shapes, in lengths of start to goal.
-        signatures: Shape (N, NUMBERS).
-    """
-
-    rows: Ints
-    shapes_mm: Floats
-    apart_mm: Floats
-    apart_scaled: Floats
-    signatures: Floats
-
-
-def far_apart(database: Database, rows: Sequence[int]) -> Apart:
-    """Return the distances between demonstrations, given by their rows; those without a direction are left out.
-
-    Missing distances are measured and stored.
-
-    Raises:
-        Busy: Another thread has been measuring for more than `PATIENCE_S`.
-    """
-    wanted = sorted({*rows})
-    kept = kept_shapes(database, wanted)
-    apart = _laid_out(kept)
-    if len(kept) == len(wanted) and not np.isnan(apart.apart_mm).any():
-        return apart
-    with _one_at_a_time():
-        known = apart.rows[~np.isnan(apart.apart_mm).any(axis=1)]
-        kept |= kept_shapes(database, sorted({*wanted} - {*known.tolist()}))  # measured by another thread
-        new = shapes_of(database, [row for row in wanted if row not in kept])
-        keep_shapes(database, new)
-        kept |= new
-        for measured in _measure(kept):
-            keep_shapes(database, measured)
-            kept |= measured
-    return _laid_out(kept)
-
-
-@contextmanager
-def _one_at_a_time() -> Iterator[None]:
-    if not _measuring.acquire(timeout=PATIENCE_S):
-        raise Busy("The distances between demonstrations are being measured; request them again in a moment.")
-    try:
-        yield
-    finally:
-        _measuring.release()
-
-
-# ---- measuring ---------------------------------------------------------------------------------------------------
-
-
-def shapes_of(database: Database, rows: Sequence[int]) -> Kept:
-    """Compute the shapes of recorded demonstrations, `DEMOS_AT_ONCE` at a time."""
-    made: Kept = {}
-    for at in range(0, len(rows), DEMOS_AT_ONCE):
-        some = Demonstration.row.in_(rows[at : at + DEMOS_AT_ONCE])
-        with database.reading() as session:
-            recorded = session.execute(select(Demonstration.row, Demonstration.demo).where(some)).all()
-        made |= {row: Measured(_shape(demo), *_NOTHING, signature_of(demo)) for row, demo in recorded}
-    return made
-
-
-def _shape(demo: Demo) -> Floats | None:
-    try:
-        return shape_of(demo)
-    except BadPath:  # it has no direction; the atlas lists it as left out
-        return None
-
-
-_NOTHING = np.empty(0, np.int64), np.empty(0), np.empty(0)
-
-
-def _measure(kept: Mapping[int, Measured]) -> Iterator[Kept]:
-    """Measure the missing distances; yield the rows that have grown after every block of pairs."""
-    apart = _laid_out(kept)
-    scaled = np.array([in_lengths(shape) for shape in apart.shapes_mm]).reshape(apart.shapes_mm.shape)
-    for block in _blocks(np.isnan(apart.apart_mm)):
-        pairs = np.array([(one, other) for one, others in block for other in others.tolist()])
-        totals = np.stack([distances_of(apart.shapes_mm, pairs), distances_of(scaled, pairs)])
-        parts = np.split(totals, np.cumsum([len(others) for _, others in block])[:-1], axis=1)
-        grown: Kept = {}
-        for (one, others), (mm, lengths) in zip(block, parts, strict=True):
-            row = int(apart.rows[one])
-            known = kept[row]
-            grown[row] = Measured(
-                known.shape_mm,
-                np.append(known.others, apart.rows[others]),
-                np.append(known.apart_mm, mm),
-                np.append(known.apart_scaled, lengths),
-                known.signature,
-            )
-        yield grown
-
-
-def _blocks(missing: NDArray[np.bool_]) -> Iterator[list[tuple[int, Ints]]]:
-    """Divide the missing pairs, (N, N), among rows, the row with most missing pairs first.
-
-    Each pair is measured in one row only. So a new demonstration takes all its pairs into its own row, and the stored
-    rows of the others need not be written again.
-    """
-    missing = missing.copy()
-    counts = missing.sum(axis=1)
-    block: list[tuple[int, Ints]] = []
-    pairs = 0
-    while counts.any():
-        one = int(counts.argmax())
-        others = np.flatnonzero(missing[one])
-        missing[one], missing[:, one] = False, False
-        counts[others] -= 1
-        counts[one] = 0
-        block.append((one, others))
-        pairs += len(others)
-        if pairs >= PAIRS_AT_ONCE:
-            yield block
-            block, pairs = [], 0
-    if block:
-        yield block
-
-
-def _laid_out(kept: Mapping[int, Measured]) -> Apart:
-    """Return the known distances as full matrices."""
-    shapes = {row: kept[row].shape_mm for row in sorted(kept)}
-    rows = np.array([row for row, shape in shapes.items() if shape is not None], np.int64)
-    apart_mm, apart_scaled = (np.full((len(rows), len(rows)), np.nan) for _ in range(2))
-    for at, row in enumerate(rows.tolist()):
-        known = kept[row]
-        places = np.searchsorted(rows, known.others).clip(max=len(rows) - 1)
-        there = rows[places] == known.others
-        for matrix, totals in ((apart_mm, known.apart_mm), (apart_scaled, known.apart_scaled)):
-            matrix[at, at] = 0.0
-            matrix[at, places[there]] = matrix[places[there], at] = totals[there]
-    whole = np.array([shape for shape in shapes.values() if shape is not None])
-    signatures = np.array([kept[row].signature for row in rows.tolist()]).reshape(-1, NUMBERS)
-    return Apart(rows, whole, apart_mm, apart_scaled, signatures)
-
-
-# ---- storage -----------------------------------------------------------------------------------------------------
-
-
-def is_current() -> ColumnElement[bool]:
-    """Return the condition of the stored rows of this version: of shapes alone, and of shapes with distances."""
-    return MeasuredShape.version.in_((VERSION, -VERSION))
-
-
-def kept_shapes(database: Database, rows: Sequence[int]) -> Kept:
-    """Return the stored measurements of demonstrations, given by their rows, of those that have any."""
-    query = select(MeasuredShape.demonstration_row, MeasuredShape.measured)
-    mine = is_current(), MeasuredShape.demonstration_row.in_(rows)
-    with database.reading() as session:
-        return {row: measured for row, measured in session.execute(query.where(*mine)).all()}  # noqa: C416 - mypy
-
-
-def keep_shapes(database: Database, measured: Mapping[int, Measured]) -> None:
-    """Replace the stored rows of some demonstrations by new measurements.
-
-    Nothing is stored if a demonstration in a row, on either side of a distance, was erased since: its distance would
-    remain.
-    """
-    packed = [
-        {"demonstration_row": row, "version": VERSION if len(one.others) else -VERSION, "measured": pack(one)}
-        for row, one in measured.items()
-    ]  # packed before the transaction, which others wait for
-    if not packed:
-        return
-    named = sorted({*measured}.union(*(one.others.tolist() for one in measured.values())))
-    with database.writing([locks.DISTANCES]) as session:
-        for some in in_parts(named):  # also of surgeons that this caller may not see
-            there = select(func.count()).select_from(Demonstration).where(Demonstration.row.in_(some))
-            if session.scalar(there, execution_options=ALL_ROWS) != len(some):
-                return
-        session.execute(delete(MeasuredShape).where(MeasuredShape.demonstration_row.in_(measured)))
-        session.execute(insert(MeasuredShape), packed)
-
-
-# ---- the atlas -----------------------------------------------------------------------------------------------------
-
-
 def atlas_of(
     database: Database, suture: str, *, scaled: bool = False, clusters: int | None = None, demo: str | None = None
-) -> Atlas:
+) -> described.Atlas:
     """Compare all demonstrations of a suture type.
 
     Args:
@@ -319,7 +112,7 @@ def atlas_of(
     else:
         shapes, far = apart.shapes_mm, apart.apart_mm
     compared = _compare(members, shapes, far / STATES, scaled, apart.signatures, found.shares)
-    return _told(suture, compared, left_out, clusters, found.asked)
+    return _atlas(suture, compared, left_out, clusters, found.asked)
 
 
 @dataclass(frozen=True)
@@ -370,35 +163,32 @@ def _asked(session: Session, demo: str, suture: str) -> str:
     return found.sha256
 
 
-def _left_out(found: _Found, without_direction: list[str]) -> LeftOutOfAtlas:
-    said = []
+def _left_out(found: _Found, without_direction: list[str]) -> described.LeftOutOfAtlas:
+    because = []
     if found.without_consent:
-        said.append(
+        because.append(
             f"Left out: {_count(found.without_consent)}, because the surgeon's consent does not cover an atlas."
         )
     if without_direction:
-        said.append(f"Left out: {_count(len(without_direction))}. {NO_DIRECTION}")
+        because.append(f"Left out: {_count(len(without_direction))}. {NO_DIRECTION}")
     if found.overlapped:
-        said.append(f"Left out: {_count(len(found.overlapped))}. {OVERLAPPED}")
+        because.append(f"Left out: {_count(len(found.overlapped))}. {OVERLAPPED}")
     if found.not_sampled:
-        said.append(
+        because.append(
             f"Left out: {_count(found.not_sampled)}. An atlas shows {MOST} at the most, drawn at random by their "
             "digests; the nearest neighbours of a demonstration are searched among all."
         )
-    return LeftOutOfAtlas(
+    return described.LeftOutOfAtlas(
         without_consent=found.without_consent,
         without_direction=without_direction,
         overlapped=[one.sha256 for one in found.overlapped],
         not_sampled=found.not_sampled,
-        because=said,
+        because=because,
     )
 
 
 def _count(demos: int) -> str:
     return f"{demos} demonstration{'' if demos == 1 else 's'}"
-
-
-# ---- computation -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -410,14 +200,14 @@ class _Compared:
     far: Floats
     scaled: bool
     surgeons: list[str]
-    whose: Ints
+    surgeon_of: Ints
     sessions: Ints
     signatures: Floats
     shares: Mapping[str, float]
 
     def of(self, surgeon: int) -> Ints:
         """Return the indices of a surgeon's demonstrations."""
-        return np.flatnonzero(self.whose == surgeon)
+        return np.flatnonzero(self.surgeon_of == surgeon)
 
     def name(self, one: int) -> str:
         """Return the digest of a demonstration."""
@@ -436,7 +226,9 @@ def _compare(
     return _Compared(members, shapes, far, scaled, slugs.tolist(), surgeons, sessions_of(members), signatures, shares)
 
 
-def _told(suture: str, compared: _Compared, left_out: LeftOutOfAtlas, clusters: int | None, asked: str | None) -> Atlas:
+def _atlas(
+    suture: str, compared: _Compared, left_out: described.LeftOutOfAtlas, clusters: int | None, asked: str | None
+) -> described.Atlas:
     far, members = compared.far, compared.members
     tree = dendrogram(far)
     number = clusters or how_many(far, tree)
@@ -444,12 +236,12 @@ def _told(suture: str, compared: _Compared, left_out: LeftOutOfAtlas, clusters: 
     places, shows = chart(far)
     recognised = recognise_arms(members, compared.signatures)
     of_asked = next((one for one in members if one.sha256 == asked), None)
-    return Atlas(
+    return described.Atlas(
         suture=suture,
         scaled=compared.scaled,
         unit=UNITS[compared.scaled],
         demos=[
-            Place(id=one.sha256, surgeon=one.surgeon, session=one.session, cluster=cluster + 1, at=at)
+            described.Place(id=one.sha256, surgeon=one.surgeon, session=one.session, cluster=cluster + 1, at=at)
             for one, cluster, at in zip(members, in_cluster.tolist(), places.round(DIGITS).tolist(), strict=True)
         ],
         recordings=len({one.recording_row for one in members}),
@@ -466,35 +258,35 @@ def _told(suture: str, compared: _Compared, left_out: LeftOutOfAtlas, clusters: 
         recognition=recognitions(recognised),
         no_recognition_because=" ".join(recognised.because) or None,
         votes=votes(recognised),
-        whose=None if of_asked is None else whose(recognised, of_asked),
+        recognised=None if of_asked is None else recognise_demo(recognised, of_asked),
         notes=[DISTANCE, CONFOUNDED, SESSIONS, *left_out.because],
     )
 
 
-def _merges(tree: Dendrogram) -> list[Merge]:
+def _merges(tree: Dendrogram) -> list[described.Merge]:
     sizes = [1] * len(tree.order)
     merges = []
     for (one, other), height in zip(tree.joined.tolist(), tree.heights.round(DIGITS).tolist(), strict=True):
         sizes.append(sizes[one] + sizes[other])
-        merges.append(Merge(one=one, other=other, distance=height, demos=sizes[-1]))
+        merges.append(described.Merge(one=one, other=other, distance=height, demos=sizes[-1]))
     return merges
 
 
-def _cluster(compared: _Compared, cluster: int, members: Ints) -> Cluster:
+def _cluster(compared: _Compared, cluster: int, members: Ints) -> described.Cluster:
     counts = Counter(compared.members[one].surgeon for one in members.tolist())
-    return Cluster(
+    return described.Cluster(
         cluster=cluster + 1,
         demos=len(members),
         medoid=compared.name(medoid(compared.far, members)),
         spread=_spread(compared.far, members),
-        surgeons=[OfSurgeon(surgeon=surgeon, demos=demos) for surgeon, demos in counts.most_common()],
+        surgeons=[described.SurgeonCount(surgeon=surgeon, demos=demos) for surgeon, demos in counts.most_common()],
     )
 
 
-def _consistency(compared: _Compared, surgeon: int) -> Consistency:
+def _consistency(compared: _Compared, surgeon: int) -> described.Consistency:
     mine = compared.of(surgeon)
     share = compared.shares.get(compared.surgeons[surgeon])
-    return Consistency(
+    return described.Consistency(
         surgeon=compared.surgeons[surgeon],
         demos=len(mine),
         recordings=len({compared.members[one].recording_row for one in mine.tolist()}),
@@ -509,20 +301,20 @@ def _spread(far: Floats, members: Ints) -> float | None:
     return round(spread(far, members), DIGITS) if len(members) > 1 else None
 
 
-def _differences(compared: _Compared) -> list[Apartness]:
+def _differences(compared: _Compared) -> list[described.SurgeonDifference]:
     """Compare the surgeons with the most demonstrations, pair by pair."""
-    counts = np.bincount(compared.whose)
+    counts = np.bincount(compared.surgeon_of)
     most = sorted(np.argsort(-counts, kind="stable")[:MOST_COMPARED].tolist())
     medoids = {one: medoid(compared.far, compared.of(one)) for one in most}
     return [_apart(compared, one, other, medoids[one], medoids[other]) for one, other in combinations(most, 2)]
 
 
-def _apart(compared: _Compared, one: int, other: int, of_one: int, of_other: int) -> Apartness:
+def _apart(compared: _Compared, one: int, other: int, of_one: int, of_other: int) -> described.SurgeonDifference:
     found = difference(compared.shapes[of_one], compared.shapes[of_other])
     names = compared.surgeons[one], compared.surgeons[other]
     (part, axis), (share, net, size) = found.where, found.most
     distance = round(found.total / STATES, DIGITS)
-    return Apartness(
+    return described.SurgeonDifference(
         one=names[0],
         other=names[1],
         distance=distance,
@@ -531,7 +323,7 @@ def _apart(compared: _Compared, one: int, other: int, of_one: int, of_other: int
         share=round(share, DIGITS),
         offset=round(net, DIGITS),
         size=round(size, DIGITS),
-        said=_said(found, names, compared.scaled)
+        sentence=_sentence(found, names, compared.scaled)
         if distance > 0
         else f"There is no difference between {names[0]} and {names[1]}.",
         shares=found.shares.round(DIGITS).tolist(),
@@ -539,7 +331,7 @@ def _apart(compared: _Compared, one: int, other: int, of_one: int, of_other: int
     )
 
 
-def _said(found: Difference, names: tuple[str, str], scaled: bool) -> str:
+def _sentence(found: Difference, names: tuple[str, str], scaled: bool) -> str:
     """Return the sentence on the part of the path and the axis with the largest difference."""
     (part, axis), (share, net, size) = found.where, found.most
     there = f"{share:.0%} of their difference is there, {axis}."

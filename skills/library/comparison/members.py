@@ -4,7 +4,7 @@ Cuts of one arm's motion that overlap show the same motion: if a demonstration s
 one's time with a newer one of the same recording and arm, only the newer one counts.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,9 +107,3 @@ def sessions_of(members: Sequence[Member]) -> Ints:
         joined = np.unique(session[sorted(numbers)])
         session[np.isin(session, joined)] = joined[0]
     return np.unique(session, return_inverse=True)[1]
-
-
-def numbered(names: Iterable[object]) -> Ints:
-    """Return names as numbers from 0, in order of first appearance, shape (N,)."""
-    numbers: dict[object, int] = {}
-    return np.array([numbers.setdefault(name, len(numbers)) for name in names], np.int64)

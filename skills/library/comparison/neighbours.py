@@ -30,7 +30,8 @@ from skills.db.models import Demonstration, Surgeon
 from skills.db.row_visibility import ALL_ROWS, ONLY
 from skills.db.session import Database
 from skills.errors import BadPath, Busy, Conflict
-from skills.library.comparison.atlas import DISTANCE, NO_DIRECTION, UNITS, keep_shapes, kept_shapes, shapes_of
+from skills.library.comparison.atlas import DISTANCE, NO_DIRECTION, UNITS
+from skills.library.comparison.measured import shapes_of, store_shapes, stored_shapes
 from skills.library.comparison.members import Member, members_among, without_overlaps
 from skills.library.people.consent import may, require
 from skills.library.recordings.demos import find_demo
@@ -44,7 +45,7 @@ MORE = 8  # neighbours beyond the requested ones, for those that turn out to be 
 
 
 @dataclass(eq=False)
-class _Held:
+class _SutureIndex:
     """The index of one suture type, and the rows without a direction, which it cannot have."""
 
     index: ShapeIndex = field(default_factory=ShapeIndex)
@@ -56,7 +57,7 @@ class _Held:
         return np.concatenate([self.index.rows, np.array(sorted(self.without), np.int64)])
 
 
-_held: WeakKeyDictionary[Engine, dict[str, _Held]] = WeakKeyDictionary()
+_indices: WeakKeyDictionary[Engine, dict[str, _SutureIndex]] = WeakKeyDictionary()
 _using = Lock()
 
 
@@ -82,10 +83,10 @@ def nearest_to(database: Database, demo: str, count: int, *, scaled: bool = Fals
     try:
         with database.reading() as session:
             asked = _asked(session, demo)
-            everybodys = _listed(session, asked.suture, everybodys=True)
-            visible = _listed(session, asked.suture) if ONLY in session.info else everybodys
-            held = _last_to_be_dropped(database, asked.suture)
-            _remove(session, held, everybodys)
+            unrestricted = _listed(session, asked.suture, unrestricted=True)
+            visible = _listed(session, asked.suture) if ONLY in session.info else unrestricted
+            held = _touch(database, asked.suture)
+            _remove(session, held, unrestricted)
             rows = held.visible[visible] if visible in held.visible else visible.rows(session)
         if visible not in held.visible:
             _add_missing(database, asked.suture, held, rows)
@@ -94,7 +95,7 @@ def nearest_to(database: Database, demo: str, count: int, *, scaled: bool = Fals
             held.visible[visible] = rows
         if asked.row not in held.index:
             raise BadPath(f"{NO_DIRECTION} Cut the hand-off from its start to the point where the needle is taken.")
-        among = None if visible == everybodys else np.isin(held.index.rows, rows, kind="table")
+        among = None if visible == unrestricted else np.isin(held.index.rows, rows, kind="table")
         shape = held.index.shape_of(asked.row)
         wanted = count
         while True:
@@ -121,12 +122,12 @@ def nearest_to(database: Database, demo: str, count: int, *, scaled: bool = Fals
 
 def forget_gone(database: Database) -> None:
     """Remove from the indices in memory what may not be compared any more; a request in progress does it itself."""
-    if not _held.get(database.engine) or not _using.acquire(blocking=False):
+    if not _indices.get(database.engine) or not _using.acquire(blocking=False):
         return
     try:
-        for suture, held in _held.get(database.engine, {}).items():
+        for suture, held in _indices.get(database.engine, {}).items():
             with database.reading() as session:
-                _remove(session, held, _listed(session, suture, everybodys=True))
+                _remove(session, held, _listed(session, suture, unrestricted=True))
     finally:
         _using.release()
 
@@ -154,20 +155,20 @@ class _Listed:
     total: int
     last: int
 
-    def rows(self, session: Session, *, everybodys: bool = False) -> Ints:
+    def rows(self, session: Session, *, unrestricted: bool = False) -> Ints:
         """Return the rows, increasing, shape (N,)."""
         rows = func.aggregate_strings(cast(Demonstration.row, Text), ",")  # one text: of many rows the fastest way
-        texts = _of_each(session, [rows], self.suture, self.surgeons, everybodys=everybodys)
+        texts = _of_each(session, [rows], self.suture, self.surgeons, unrestricted=unrestricted)
         numbers = [np.array(text.split(","), np.int64) for (text,) in texts if text]
         return np.setdiff1d(np.concatenate(numbers) if numbers else np.empty(0, np.int64), np.array(self.withdrawn))
 
 
-def _listed(session: Session, suture: str, *, everybodys: bool = False) -> _Listed:
-    options = ALL_ROWS if everybodys else {}
+def _listed(session: Session, suture: str, *, unrestricted: bool = False) -> _Listed:
+    options = ALL_ROWS if unrestricted else {}
     of = Demonstration.row
     surgeons = [one.row for one in session.scalars(select(Surgeon), execution_options=options) if may(one, "atlas")]
     figures = [func.count(), func.coalesce(func.sum(of), 0), func.coalesce(func.max(of), 0)]
-    found = _of_each(session, figures, suture, surgeons, everybodys=everybodys)
+    found = _of_each(session, figures, suture, surgeons, unrestricted=unrestricted)
     counts, totals, lasts = zip(*found, strict=True) if found else ((), (), ())
     withdrawn = select(of).where(Demonstration.withdrawn_at.is_not(None))
     gone = tuple(sorted(session.scalars(withdrawn, execution_options=options)))
@@ -175,38 +176,38 @@ def _listed(session: Session, suture: str, *, everybodys: bool = False) -> _List
 
 
 def _of_each(
-    session: Session, columns: Sequence[ColumnElement[Any]], suture: str, surgeons: Sequence[int], *, everybodys: bool
+    session: Session, columns: Sequence[ColumnElement[Any]], suture: str, surgeons: Sequence[int], *, unrestricted: bool
 ) -> list[Row[Any]]:
     """Aggregate the rows of surgeons' demonstrations; an index alone has them, where a row has the whole motion."""
     query = select(*columns).where(Demonstration.suture == suture)
-    options = ALL_ROWS if everybodys else {}
+    options = ALL_ROWS if unrestricted else {}
     return [
         session.execute(query.where(Demonstration.surgeon_row.in_(some)), execution_options=options).one()
         for some in in_parts(surgeons)
     ]
 
 
-def _last_to_be_dropped(database: Database, suture: str) -> _Held:
+def _touch(database: Database, suture: str) -> _SutureIndex:
     """Return the index of a suture type, now the last that makes room for others."""
-    indices = _held.setdefault(database.engine, {})
-    indices[suture] = indices.pop(suture) if suture in indices else _Held()
+    indices = _indices.setdefault(database.engine, {})
+    indices[suture] = indices.pop(suture) if suture in indices else _SutureIndex()
     return indices[suture]
 
 
-def _remove(session: Session, held: _Held, everybodys: _Listed) -> None:
+def _remove(session: Session, held: _SutureIndex, unrestricted: _Listed) -> None:
     """Remove the rows that may not be compared any more."""
-    if everybodys == held.listed:
+    if unrestricted == held.listed:
         return
-    gone = np.setdiff1d(held.known(), everybodys.rows(session, everybodys=True)).tolist()
+    gone = np.setdiff1d(held.known(), unrestricted.rows(session, unrestricted=True)).tolist()
     held.index.remove(gone)
     held.without -= {*gone}
-    held.listed = everybodys
+    held.listed = unrestricted
     held.visible.clear()
 
 
-def _add_missing(database: Database, suture: str, held: _Held, visible: Ints) -> None:
+def _add_missing(database: Database, suture: str, held: _SutureIndex, visible: Ints) -> None:
     """Add the rows that a caller may see and that the index does not have."""
-    indices, missing = _held[database.engine], np.setdiff1d(visible, held.known()).tolist()
+    indices, missing = _indices[database.engine], np.setdiff1d(visible, held.known()).tolist()
     if len(held.index) + len(missing) > places.MOST:
         raise Conflict(
             f"There are {len(held.index) + len(missing)} demonstrations of '{suture}', and an index holds "
@@ -219,11 +220,11 @@ def _add_missing(database: Database, suture: str, held: _Held, visible: Ints) ->
         _add(database, held, missing[at : at + ROWS_AT_ONCE])
 
 
-def _add(database: Database, held: _Held, rows: list[int]) -> None:
-    kept = kept_shapes(database, rows)
-    new = shapes_of(database, [row for row in rows if row not in kept])
-    keep_shapes(database, new)
-    for row, measured in (kept | new).items():
+def _add(database: Database, held: _SutureIndex, rows: list[int]) -> None:
+    known = stored_shapes(database, rows)
+    new = shapes_of(database, [row for row in rows if row not in known])
+    store_shapes(database, new)
+    for row, measured in (known | new).items():
         if measured.shape_mm is None:
             held.without.add(row)
         else:

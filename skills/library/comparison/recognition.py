@@ -27,11 +27,11 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.segments import movements_by_arm
 from skills.errors import BadInput, BadPath, BadRecording, Conflict, NotFound
-from skills.library.comparison.members import Member, members_of, numbered, sessions_of
-from skills.library.people.catalogue import find_suture_type
+from skills.library.comparison.members import Member, members_of, sessions_of
 from skills.library.people.recorded import in_recording
-from skills.library.recordings.recordings import Teller, find_recording, stored_recording
-from skills.schemas.comparison import Calibrated, Likely, RecognisedRecording, Recognition, Votes, Whose
+from skills.library.people.suture_types import find_suture_type
+from skills.library.recordings.recordings import Parser, find_recording, stored_recording
+from skills.schemas.comparison import CalibrationBin, Likely, RecognisedDemo, RecognisedRecording, Recognition, Votes
 
 BINS = 5  # of a calibration curve, with equally many demonstrations each
 
@@ -69,7 +69,7 @@ def recognise_arms(members: Sequence[Member], signatures: Floats) -> Recognised:
         members: The demonstrations.
         signatures: Their signatures, shape (N, NUMBERS).
     """
-    sessions, recordings = sessions_of(members), numbered(one.recording_row for one in members)
+    sessions, recordings = sessions_of(members), np.array([one.recording_row for one in members])
     arms: dict[str, _Arm] = {}
     because = []
     for arm in sorted({one.arm for one in members}):
@@ -106,7 +106,10 @@ def _recognition(arm: str, validated: Validated) -> Recognition:
         log_loss=validated.log_loss,
         log_loss_of_guessing=log(len(validated.surgeons)),
         sureness=validated.sureness,
-        curve=[Calibrated(demos=demos, said=said, right=right) for demos, said, right in validated.curve(BINS)],
+        curve=[
+            CalibrationBin(demos=demos, predicted=predicted, right=right)
+            for demos, predicted, right in validated.curve(BINS)
+        ],
         stranger_if_known=float(validated.stranger.mean()),
         stranger_if_left_out=float(validated.unknown.mean()),
     )
@@ -142,7 +145,7 @@ def _voted(found: Recognised, recording_row: int) -> tuple[str | None, int]:
     return (slugs[int(vote(np.array(ballots)).argmax())], len(ballots)) if ballots else (None, 0)
 
 
-def whose(found: Recognised, member: Member) -> Whose | None:
+def recognise_demo(found: Recognised, member: Member) -> RecognisedDemo | None:
     """Recognise the surgeon of a demonstration; None if its arm has no recognition."""
     arm = found.arms.get(member.arm)
     if arm is None:
@@ -151,7 +154,7 @@ def whose(found: Recognised, member: Member) -> Whose | None:
     probability, stranger = recognise(arm.signatures, arm.surgeons, arm.sessions, arm.recordings, one, arm.validated)
     likely = sorted(zip(probability.tolist(), arm.slugs, strict=True), reverse=True)
     voted, voters = _voted(found, member.recording_row)
-    return Whose(
+    return RecognisedDemo(
         demo=member.sha256,
         arm=member.arm,
         surgeon=member.surgeon,
@@ -171,14 +174,14 @@ MOVEMENTS = (
 )
 
 
-def recognise_recording(database: Database, recording_sha256: str, suture: str, tell: Teller) -> RecognisedRecording:
+def recognise_recording(database: Database, recording_sha256: str, suture: str, parse: Parser) -> RecognisedRecording:
     """Recognise the surgeon of a recording by all its movements.
 
     Args:
         database: The database, restricted to the rows that the caller may see.
         recording_sha256: Digest of the recording, with a demonstration in the atlas of the suture type.
         suture: The suture type.
-        tell: The reader of recordings, possibly in another process.
+        parse: The reader of recordings, possibly in another process.
 
     Raises:
         NotFound: There is no such recording or suture type, or it has no demonstration that may be compared.
@@ -186,7 +189,7 @@ def recognise_recording(database: Database, recording_sha256: str, suture: str, 
         BadInput: There are not two surgeons with two sessions each, or no movement of the recording could be tested.
     """
     chosen = _known(database, recording_sha256, suture)
-    moved = {row: _movements(database, one, tell) for row, one in chosen.items()}
+    moved = {row: _movements(database, one, parse) for row, one in chosen.items()}
     still = _known(database, recording_sha256, suture)  # consent may have ended while they were read
     pairs = [pair for row, some in moved.items() if row in still for pair in some]
     found = recognise_arms([member for member, _ in pairs], np.array([signature for _, signature in pairs]))
@@ -237,10 +240,10 @@ def _known(database: Database, recording_sha256: str, suture: str) -> dict[int, 
         return {row: _Known(sha256, by_row[row]) for row, sha256 in session.execute(digests).all()}
 
 
-def _movements(database: Database, known: _Known, tell: Teller) -> list[tuple[Member, Floats]]:
+def _movements(database: Database, known: _Known, parse: Parser) -> list[tuple[Member, Floats]]:
     """Return the movements of a recording as members of its surgeon, with their signatures."""
     try:
-        recording = stored_recording(database, known.recording, tell).recording
+        recording = stored_recording(database, known.recording, parse).recording
     except BadRecording:  # this version does not read it; the others are compared
         return []
     found = []

@@ -27,14 +27,15 @@ from skills.demonstration.demonstration import Demo, cut_demo
 from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import TIE_BREAK
 from skills.library.comparison import calibrations
-from skills.library.comparison.atlas import is_current
+from skills.library.comparison.measured import is_current
 from skills.library.comparison.members import member_of, sessions_of, without_overlaps
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import may, require
 from skills.library.people.recorded import in_recording
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
 from skills.library.recordings.demos import find_demo, newest_demo
-from skills.library.recordings.recordings import Teller, find_recording, stored_recording
+from skills.library.recordings.recordings import Parser, find_recording, stored_recording
 from skills.schemas.scores import (
     CurvePoint,
     Percentiles,
@@ -111,7 +112,7 @@ def others_of(
         return
     totals = distances(np.stack([laid(shape, onto_mm) for shape in shapes.values()]), onto_mm[None])[:, 0]
     for (row, shape), total in zip(shapes.items(), totals.tolist(), strict=True):
-        reported = {kind.name: agreed[row].report.get(kind.name) for kind in KINDS}
+        reported = {kind.name: getattr(agreed[row].report, kind.name, None) for kind in KINDS}
         distance_mm = total / len(onto_mm)
         numbers = {**reported, "size_mm": float(shape[-1, 0]), "distance_mm": distance_mm}
         yield Other(agreed[row], numbers, distance_mm)
@@ -274,13 +275,13 @@ class _Scored:
     row: Demonstration | None = None
 
 
-def score(database: Database, asked: ScoreIn, tell: Teller) -> Score:
+def score(database: Database, asked: ScoreIn, parse: Parser) -> Score:
     """Score a motion against a style.
 
     Args:
         database: The database, restricted to the rows that the caller may see.
         asked: The request.
-        tell: The reader of recordings, possibly in another process.
+        parse: The reader of recordings, possibly in another process.
 
     Raises:
         NotFound: There is no such surgeon, suture type, demonstration or recording, or nothing of the style.
@@ -296,13 +297,13 @@ def score(database: Database, asked: ScoreIn, tell: Teller) -> Score:
         scored = _stored(session, asked)
         taught, expert = reference.demo, _of_expert(session, reference, scored.row if scored else None)
     if scored is None:
-        scored = _of_recording(database, asked, tell)
+        scored = _of_recording(database, asked, parse)
     # No transaction is open during the computation.
     numbers, beside = measure(scored.demo), measure(taught)
     deviation = laid_on(scored.demo, taught)
     expert = [one for one in expert if _has_direction(one)]
     named = differences(scored.demo, expert, taught) if expert else None
-    skill = _skill(database, scored.recording, asked.task, tell)
+    skill = _skill(database, scored.recording, asked.task, parse)
     with database.reading() as session:  # again: consent may have ended while the two were compared
         _agreed_still(session, [reference, scored.row], scored.recording)
         compared = [reference, *([scored.row] if scored.row else [])]
@@ -404,13 +405,13 @@ def _stored(session: Session, asked: ScoreIn) -> _Scored | None:
     return _Scored(row.demo, row.recording, row)
 
 
-def _of_recording(database: Database, asked: ScoreIn, tell: Teller) -> _Scored:
+def _of_recording(database: Database, asked: ScoreIn, parse: Parser) -> _Scored:
     """Cut the motion to be scored out of a stored recording, without storing it."""
     assert asked.recording is not None
     with database.reading() as session:
         stored = find_recording(session, asked.recording)
         _agreed_by_all(session, stored)
-    recording = stored_recording(database, stored.sha256, tell).recording
+    recording = stored_recording(database, stored.sha256, parse).recording
     demo = cut_demo(recording, arm=asked.arm, topic=asked.topic, start_s=asked.start_s, end_s=asked.end_s)
     return _Scored(demo, stored)
 
@@ -442,7 +443,7 @@ def _agreed_still(session: Session, compared: Sequence[Demonstration | None], re
 NOT_AGREED = "Not rated: the consent of a surgeon in this recording does not cover comparisons."
 
 
-def _skill(database: Database, recording: StoredRecording, task: str | None, tell: Teller) -> Skill:
+def _skill(database: Database, recording: StoredRecording, task: str | None, parse: Parser) -> Skill:
     """Return the calibrated model's rating of a whole recording, or the reason why there is none."""
     with database.reading() as session:
         stored = calibrations.newest(session)
@@ -468,7 +469,7 @@ def _skill(database: Database, recording: StoredRecording, task: str | None, tel
     if not agreed:
         return unrated(NOT_AGREED)
     try:
-        trial = measure_trial(stored_recording(database, recording.sha256, tell).recording)
+        trial = measure_trial(stored_recording(database, recording.sha256, parse).recording)
         return rate(model, named, trial, stored.sha256, judged)
     except BadInput as error:
         return unrated(f"Not rated: {error.message}")

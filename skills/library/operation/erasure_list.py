@@ -17,17 +17,18 @@ from sqlalchemy import Select, exists, func, select, tuple_
 from sqlalchemy.orm import Session
 
 from skills.db.models import SUCCESS, Demonstration, Erasure, LastUsed, PolicyVersion, Release, StoredRecording, Surgeon
-from skills.db.service_tables import Event, Key
+from skills.db.service_tables import Event, Key, record_event
 from skills.db.session import Database
 from skills.errors import Corrupt
 from skills.library.operation.files import appearing_file, locked_folder
-from skills.library.people.catalogue import put_surgeon, salted
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.people.keys import revoke_key
+from skills.library.people.surgeons import put_consent, salted
 from skills.library.policies.releases import withdraw_policies
 from skills.library.recordings.demos import MARKS, mark_demo, withdraw_demo
 from skills.packing import canonical, sha256
 from skills.schemas import DemoOutcome
+from skills.schemas.people import Consent
 
 ERASURES: Final = "suture-skills erasures 1"
 # Events that end something permanently, with the name of their list. Releases end by being superseded as well.
@@ -51,7 +52,6 @@ LISTED = (
 )
 T = TypeVar("T")
 M = TypeVar("M", datetime, int)
-Consent = dict[str, Any] | None
 # By the list names in `ENDS`: digests or ids, and the moment at which each last ended.
 Ended = Mapping[str, Mapping[str, datetime]]
 
@@ -75,7 +75,7 @@ class Erasures:
 
     surgeons: Mapping[str, tuple[str, datetime]] = field(default_factory=dict)
     ended: Ended = field(default_factory=dict)
-    consents: Mapping[str, tuple[datetime, Consent]] = field(default_factory=dict)
+    consents: Mapping[str, tuple[datetime, Consent | None]] = field(default_factory=dict)
     outcomes: Mapping[str, tuple[datetime, DemoOutcome]] = field(default_factory=dict)
     numbers: Mapping[str, int] = field(default_factory=dict)
 
@@ -317,21 +317,22 @@ def _served(session: Session) -> set[tuple[int, str]]:
     return {(surgeon, suture) for surgeon, suture in session.execute(released)}
 
 
-def _narrow(session: Session, consents: Mapping[str, tuple[datetime, Consent]]) -> int:
+def _narrow(session: Session, consents: Mapping[str, tuple[datetime, Consent | None]]) -> int:
     """Restrict each surgeon's consent to the uses that both the backup and the consent stated since allow."""
     changed = 0
     for surgeon in session.scalars(select(Surgeon)).all():
         _, stated = consents.get(surgeon.subject, (None, None))
         both = _both(surgeon.consent, stated)
         if both != surgeon.consent:
-            put_surgeon(session, surgeon.slug, {"consent": both}, "restore")
+            record_event(session, "restore", "change", "surgeon", surgeon.subject, surgeon)
+            put_consent(session, surgeon, both, "restore")
             changed += 1
     return changed
 
 
-def _both(one: Consent, other: Consent) -> Consent:
+def _both(one: Consent | None, other: Consent | None) -> Consent | None:
     """Return the intersection of two consents: the uses in both, until the earlier end; None allows everything."""
     if one is None or other is None:
         return one or other
-    ends = [end for end in (one.get("until"), other.get("until")) if end is not None]
-    return one | {"uses": [use for use in one["uses"] if use in other["uses"]], "until": min(ends, default=None)}
+    ends = [end for end in (one.until, other.until) if end is not None]
+    return Consent(uses=[use for use in one.uses if use in other.uses], until=min(ends, default=None))

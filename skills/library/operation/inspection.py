@@ -52,7 +52,8 @@ from skills.library.operation.integrity import covered, demo_identity, planned, 
 from skills.library.operation.jobs import identity_of
 from skills.library.policies.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
 from skills.library.policies.versions import path_of, poses_of_demonstrations
-from skills.library.recordings.recordings import Teller, alike, cached_content, read_entry, recording_bytes
+from skills.library.recordings.content_cache import alike, cached_content, read_entry
+from skills.library.recordings.recordings import Parser, recording_bytes
 from skills.packing import canonical, sha256
 from skills.settings import Settings
 from skills.transparency.notes import Note
@@ -92,7 +93,7 @@ class Checked:
 
 def inspect_installation(
     database: Database,
-    tell: Teller = parse_recording,
+    tell: Parser = parse_recording,
     *,
     decode_all: bool = False,
     heads: Sequence[Note] | None = None,
@@ -275,7 +276,7 @@ def _describe(error: Exception) -> str:
 # ---- the cache of recordings -------------------------------------------------------------------------------------
 
 
-def _decoded_again(database: Database, tell: Teller, every: bool) -> Iterator[Checked]:
+def _decoded_again(database: Database, tell: Parser, every: bool) -> Iterator[Checked]:
     """Compare cached contents with their recordings decoded again: of the newest recording, or of every one."""
     checked = Checked("recordings decoded")
     yield checked
@@ -292,7 +293,7 @@ def _decoded_again(database: Database, tell: Teller, every: bool) -> Iterator[Ch
     yield checked
 
 
-def _decoded_otherwise(database: Database, row: int, tell: Teller) -> Why:
+def _decoded_otherwise(database: Database, row: int, tell: Parser) -> Why:
     """Yield the fault of a cached content: it differs from the recording's bytes. Damaged ones are found before."""
     with database.reading() as session:
         stored = session.get(StoredRecording, row)
@@ -317,7 +318,7 @@ def _decoded_otherwise(database: Database, row: int, tell: Teller) -> Why:
 
 
 def inspect_policies(
-    database: Database, tell: Teller, relearn: Settings | None, limit: int | None = None
+    database: Database, tell: Parser, relearn: Settings | None, limit: int | None = None
 ) -> Iterator[Checked]:
     """Learn policies again if wanted, and compute the certificates of the others again; see `inspect_installation`."""
     done: set[int] = set()

@@ -14,7 +14,8 @@ from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release, Surgeon, SutureType
 from skills.library.operation.overview import MOST, MOST_LISTED
-from skills.library.people.catalogue import find_surgeon, find_suture_type
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import is_served, served
 
 State = Literal["released", "trained", "stored", "empty"]

@@ -21,6 +21,8 @@ from sqlalchemy.orm import Session
 
 from skills.db import now
 from skills.db.models import (
+    AT_ONCE_BYTES,
+    CHUNK_BYTES,
     LooseChunks,
     ParsedChunk,
     ParsedRecording,
@@ -35,7 +37,7 @@ from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.library.operation import locks
 from skills.library.operation.jobs import ACTIVE, BATCH, EXPORT, PICTURES, UNSYNCHRONISED, cancel_parts, identity_of
-from skills.library.recordings.recordings import AT_ONCE_BYTES, CHUNK_BYTES, UNFINISHED
+from skills.library.recordings.content_cache import UNFINISHED
 from skills.settings import Settings
 
 JOBS_AT_ONCE = 300

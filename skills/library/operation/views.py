@@ -18,7 +18,7 @@ from skills.learning.policy import Policy
 from skills.library.operation.integrity import covered, learnt
 from skills.library.people.recorded import shown_recording
 from skills.library.policies.versions import learnt_from
-from skills.library.recordings.recordings import Teller
+from skills.library.recordings.recordings import Parser
 
 MOST_STARTS = 20_000  # drawn smoothly by a browser: of a larger grid every second, third, ... cell is returned
 MOST_SAMPLES = 1500  # of a line on a screen: more are not visible
@@ -86,7 +86,7 @@ def moves_to_goal(policy: Policy, reaches: NDArray[np.bool_]) -> NDArray[np.int6
     return counted
 
 
-def traces_of(database: Database, recording_sha256: str, tell: Teller) -> dict[str, Any]:
+def traces_of(database: Database, recording_sha256: str, tell: Parser) -> dict[str, Any]:
     """Return the signals of a stored recording's arms, jaws and clutch over time."""
     recording = shown_recording(database, recording_sha256, tell).recording
     return {"duration_s": recording.duration_s, "arms": [_arm(recording, arm) for arm in recording.arms]}

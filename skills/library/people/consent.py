@@ -11,13 +11,14 @@ allowed.
 
 import json
 from datetime import date
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 from sqlalchemy import ColumnElement, Text, and_, cast, or_
 
 from skills.db import now
 from skills.db.models import Surgeon
 from skills.errors import Conflict
+from skills.schemas.people import Consent
 
 Use = Literal["training", "export", "atlas", "any"]  # the last one is covered by each of the others: docs/keys.md
 
@@ -33,8 +34,8 @@ class Consenting(Protocol):
         """The pseudonym."""
 
     @property
-    def consent(self) -> dict[str, Any] | None:
-        """The recorded consent: `uses`, and `until`, the last day, as 2030-12-31 or None."""
+    def consent(self) -> Consent | None:
+        """The recorded consent."""
 
 
 def today() -> date:
@@ -47,13 +48,12 @@ def refusal(surgeon: Consenting, use: Use) -> Conflict | None:
     consent = surgeon.consent
     if consent is None:
         return None
-    if use not in consent["uses"] and not (use == "any" and consent["uses"]):
-        covers = ", ".join(consent["uses"]) or "nothing"
+    if use not in consent.uses and not (use == "any" and consent.uses):
+        covers = ", ".join(consent.uses) or "nothing"
         return Conflict(f"The consent of '{surgeon.slug}' does not cover {CALLED[use]}; it covers {covers}.")
-    until = last_day(consent)
     # The last day itself is covered.
-    if until is not None and not today() <= until:
-        return Conflict(f"The consent of '{surgeon.slug}' expired on {until}.")
+    if consent.until is not None and not today() <= consent.until:
+        return Conflict(f"The consent of '{surgeon.slug}' expired on {consent.until}.")
     return None
 
 
@@ -73,10 +73,9 @@ def require(surgeon: Consenting, use: Use) -> None:
         raise refused
 
 
-def last_day(consent: dict[str, Any] | None) -> date | None:
+def last_day(consent: Consent | None) -> date | None:
     """Return the last day on which a consent holds; None if it has no end."""
-    until = None if consent is None else consent.get("until")
-    return None if until is None else date.fromisoformat(until)
+    return None if consent is None else consent.until
 
 
 AS_TEXT = cast(Surgeon.consent, Text)
@@ -87,4 +86,4 @@ def covered(use: Use) -> ColumnElement[bool]:
     until = Surgeon.consent["until"].as_string()
     # A substring search is exact: besides `uses`, the only text in a consent is a date.
     named = AS_TEXT.contains(json.dumps(use))
-    return or_(AS_TEXT.is_(None), AS_TEXT == "null", and_(named, or_(until.is_(None), until >= today().isoformat())))
+    return or_(AS_TEXT.is_(None), and_(named, or_(until.is_(None), until >= today().isoformat())))

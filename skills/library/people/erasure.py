@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from skills.db import in_parts, now
 from skills.db.changes import announce
 from skills.db.models import (
+    AT_ONCE_BYTES,
     Demonstration,
     DemonstrationOutcome,
     ErasedInterval,
@@ -45,11 +46,11 @@ from skills.errors import Conflict, NotAllowed
 from skills.library.operation.jobs import ACTIVE as NOT_ENDED
 from skills.library.operation.jobs import UNSYNCHRONISED, forget_styles
 from skills.library.operation.sweep import delete_jobs
-from skills.library.people.catalogue import find_surgeon, salted
+from skills.library.people.surgeons import find_surgeon, salted
 from skills.library.policies.releases import withdraw_resting_on
 from skills.library.recordings.datasets import drop_exports, exports_from, exports_of
 from skills.library.recordings.demos import find_demo
-from skills.library.recordings.recordings import AT_ONCE_BYTES, find_recording
+from skills.library.recordings.recordings import find_recording
 from skills.remedies import Action, Remedy
 
 INTERVAL = ["recording_row", "surgeon_row", "start_s", "end_s"]

@@ -20,20 +20,20 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import lru_cache
-from typing import Any
 
 from sqlalchemy import delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import now, rfc3339
+from skills.db import now
 from skills.db.history import HISTORY
 from skills.db.leaves import LEAVES
 from skills.db.row_visibility import Only
 from skills.db.service_tables import Key, KeySurgeon, SignIn, record_event
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.operation.history import edited_rows
-from skills.library.people.catalogue import find_surgeon
+from skills.library.people.surgeons import find_surgeon
 from skills.remedies import Action, Remedy
+from skills.schemas import people as described
 from skills.schemas.requests import OWNER
 from skills.settings import Role
 
@@ -184,23 +184,22 @@ def held(key: Key) -> Holder:
     """Return the holder of a key's row."""
     slugs = frozenset(surgeon.slug for surgeon in key.surgeons) if key.restricted else None
     only = _only(key.owner, frozenset(surgeon.row for surgeon in key.surgeons)) if key.restricted else None
-    return Holder(key.id, key.owner, key.role, key.expires_at, slugs, only)  # type: ignore[arg-type]
+    return Holder(key.id, key.owner, key.role, key.expires_at, slugs, only)
 
 
-def about_key(key: Key) -> dict[str, Any]:
-    """Return the JSON of a key, without its secret."""
-    ended = "revoked" if key.revoked_at is not None else "active" if held(key).counts(now()) else "expired"
-    return {
-        "key": key.id,
-        "owner": key.owner,
-        "role": key.role,
-        "surgeons": [surgeon.slug for surgeon in key.surgeons] if key.restricted else None,
-        "created_at": rfc3339(key.created_at),
-        "created_by": key.created_by,
-        "expires_at": rfc3339(key.expires_at),
-        "revoked_at": rfc3339(key.revoked_at),
-        "state": ended,
-    }
+def about_key(key: Key) -> described.Key:
+    """Return what an admin sees of a key, without its secret."""
+    return described.Key(
+        key=key.id,
+        owner=key.owner,
+        role=key.role,
+        surgeons=[surgeon.slug for surgeon in key.surgeons] if key.restricted else None,
+        created_at=key.created_at,
+        created_by=key.created_by,
+        expires_at=key.expires_at,
+        revoked_at=key.revoked_at,
+        state="revoked" if key.revoked_at is not None else "active" if held(key).counts(now()) else "expired",
+    )
 
 
 def is_owner(name: str) -> bool:
@@ -246,7 +245,7 @@ def signed_in(session: Session, cookies: Iterable[str], lasts: Lasts) -> dict[st
 
     Sign-ins that ended, and those that the service did not write, or whose key it did not, are left out.
     """
-    standing: dict[str, tuple[Holder, bool]] = {}
+    holders: dict[str, tuple[Holder, bool]] = {}
     by_digest = {digest_of(cookie): cookie for cookie in cookies}
     digests, at = list(by_digest), now()
     for first in range(0, len(digests), KEYS_AT_ONCE):
@@ -260,8 +259,8 @@ def signed_in(session: Session, cookies: Iterable[str], lasts: Lasts) -> dict[st
             idle_s, age_s = (at - found.used_at).total_seconds(), (at - found.created_at).total_seconds()
             # The key's own expiry is left to the caller, as in `holders_of`.
             if found.key.revoked_at is None and idle_s < lasts.idle_s and age_s < lasts.most_s:
-                standing[by_digest[found.digest]] = held(found.key), idle_s > NOTED_S
-    return standing
+                holders[by_digest[found.digest]] = held(found.key), idle_s > NOTED_S
+    return holders
 
 
 def note_use(session: Session, cookie: str) -> None:

@@ -20,7 +20,7 @@ from skills.db.session import Database
 from skills.errors import Conflict
 from skills.formats.parsed import ParsedContent
 from skills.library.people import consent
-from skills.library.recordings.recordings import Teller, find_recording, stored_recording
+from skills.library.recordings.recordings import Parser, find_recording, stored_recording
 
 # Bare tables, because a surgeon whom the caller may not see has to consent too.
 _DEMOS, _NAMED, _ERASED = (
@@ -88,15 +88,15 @@ def recording_for(session: Session, recording_sha256: str, use: consent.Use) -> 
     return recording
 
 
-def shown_recording(database: Database, recording_sha256: str, tell: Teller) -> ParsedContent:
+def shown_recording(database: Database, recording_sha256: str, parse: Parser) -> ParsedContent:
     """Return what is read of a stored recording, to be shown; everybody in it is asked after it was read.
 
     It raises the errors of `recording_for`, and of `skills.library.recordings.recordings.stored_recording`.
     """
-    told = stored_recording(database, recording_sha256, tell)
+    parsed = stored_recording(database, recording_sha256, parse)
     with database.reading() as session:
         recording_for(session, recording_sha256, "any")
-    return told
+    return parsed
 
 
 def recorded_in(session: Session, episodes: Episodes) -> SurgeonsRecorded:

@@ -41,6 +41,7 @@ from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
 from skills.schemas.plans import PlanIn, PsmMIn
 from skills.schemas.reach import Reach, ReachIn
+from skills.schemas.recordings import TableIn
 from skills.verification.reach import MAX_PLACES, ReachPlace, map_reach
 
 
@@ -56,7 +57,7 @@ def find_suture_points(upload: Upload, arm: str | None, frame: str | None, read:
     Raises:
         BadRecording: It cannot be used; `skills.errors` lists the kinds.
     """
-    scene = read_upload(upload.read_as({}), partial(read, target=READ))
+    scene = read_upload(upload.read_as(TableIn()), partial(read, target=READ))
     return suture_points(scene, arm=arm, frame=frame)
 
 

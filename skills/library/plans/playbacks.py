@@ -94,7 +94,7 @@ def headline(about: dict[str, Any], report: dict[str, Any], *, errors: ArmErrors
 
 
 def judged_under(report: dict[str, Any], errors: ArmErrors) -> dict[str, Any]:
-    """Return the part of a stored report that counts: a `DoubtUnder` as JSON, under the errors stated for the arms.
+    """Return the part of a stored report that counts: a `EstimateUnder` as JSON, under the errors stated for the arms.
 
     These are the errors of the playback's request, or else those that the installation states now.
 
@@ -253,10 +253,10 @@ def check_playback(
     errors = ArmErrors(**request["errors"])
     verdict = judge_plan(plan, trajectory, measured, policy=followed, demo=demo, errors=errors)
     report = _finite(asdict(verdict.report)) | {
-        "doubt": _finite(asdict(verdict.doubt)),
+        "doubt": _finite(asdict(verdict.success)),
         "stated_by": request["stated_by"],
         "check_version": request["check_version"],
-        "failure_in_words": verdict.failure_in_words,
+        "failure_in_words": verdict.failure_sentence,
         "scene": None if verdict.scene is None else _finite(asdict(verdict.scene)),
         "tissue": "not given" if plan.scene is None or plan.scene.tissue is None else "judged",
         "plan": request["plan"],
@@ -337,7 +337,7 @@ def draw_pictures(
         playback = _playback(session, request)
         measured, report = playback.measured, playback.report
     trajectory = measured.trajectory
-    shot = film.shoot(trajectory, pad_top_mm=float(measured.pad_mm[2]), memory_bytes=settings.playback_memory_bytes)
+    shot = film.make_film(trajectory, pad_top_mm=float(measured.pad_mm[2]), memory_bytes=settings.playback_memory_bytes)
     drawn = Pictures(
         animation_mp4=shot.mp4,
         animation_gif=shot.gif,

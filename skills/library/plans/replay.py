@@ -22,7 +22,7 @@ from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt
 from skills.formats.replay_bag import (
     ArmMotion,
-    Timetable,
+    ExecutorTimetable,
     arms_of,
     folder_of,
     held_jaw_rad,
@@ -170,7 +170,9 @@ def replay_bag(
         pass_index=pass_index,
     )
     members = {name: _written(paper) for name, paper in papers.items()}
-    timetable = Timetable(plan=row.sha256, use=USE, before_each_pass=BY_HAND, passes=pass_times(trajectory, arms))
+    timetable = ExecutorTimetable(
+        plan=row.sha256, use=USE, before_each_pass=BY_HAND, passes=pass_times(trajectory, arms)
+    )
     members[EXECUTOR] = _written(timetable.model_dump())
     head = proofs.head_over(database, rows)
     members[README] = _readme(papers[PLAN], papers[VERDICT]["report"], arms, head).encode()
@@ -300,8 +302,8 @@ def check_doubt(report: dict[str, Any], *, errors: ArmErrors, lower_bound: float
     """Refuse a plan whose least certain pass succeeds too rarely when the world differs from the plan.
 
     Args:
-        report: A playback's stored report; its `doubt` is a `skills.verification.probabilities.Doubt` as JSON, with
-            null for NaN.
+        report: A playback's stored report; its `doubt` is a `skills.verification.probabilities.SuccessEstimate` as
+            JSON, with null for NaN.
         errors: The errors of the arms that the installation states; those of the playback's request come first.
         lower_bound: The value that the lower bounds of all passes have to reach.
 
@@ -377,7 +379,7 @@ def _readme(plan: dict[str, Any], report: dict[str, Any], arms: tuple[ArmMotion,
         plan["in_words"],
         "",
         f"Every pass is likely enough to {well} with {errors_in_words(errors.name)}, as the {stated_by} stated them:",
-        f"{errors.in_words}.",
+        f"{errors.describe()}.",
         f"Not judged: {', '.join(not_judged(under))}.",
         "With greater errors it was not judged: compare these with your arms.",
         "",

@@ -33,8 +33,9 @@ from skills.gridworld import paper
 from skills.gridworld.grid import PathReport, choose_grid, describe_path, discretize
 from skills.library.operation import jobs, locks
 from skills.library.operation.jobs import RequestedJob, Store, identity_of
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import require
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.plans.plans import find_plan, hand_of, plan_sutures
 from skills.library.plans.playbacks import (
     check_playback,
@@ -53,8 +54,9 @@ from skills.library.policies.training import (
     training_request,
     with_partners,
 )
-from skills.library.recordings.demos import add_demo, choose_part, find_demo
-from skills.library.recordings.recordings import Teller, confined_reader, find_recording, stored_recording
+from skills.library.recordings.demos import add_demo, find_demo
+from skills.library.recordings.parts import choose_part
+from skills.library.recordings.recordings import Parser, confined_reader, find_recording, stored_recording
 from skills.remedies import Remedy
 from skills.schemas.demos import DemoIn
 from skills.schemas.plans import PlanIn, SuturePointIn
@@ -114,7 +116,7 @@ def perform_try(database: Database, request: dict[str, Any], settings: Settings)
     return store
 
 
-def try_recording(database: Database, asked: TryIn, actor: str, settings: Settings, read: Teller) -> Iterator[TryStep]:
+def try_recording(database: Database, asked: TryIn, actor: str, settings: Settings, read: Parser) -> Iterator[TryStep]:
     """Cut, learn, certify, release if wanted, plan, play and judge a recording; yield each step when it is done.
 
     The steps end with a question that the request does not answer, with a refusal, or with the verdict.
@@ -149,7 +151,7 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         cut = cut.model_copy(update={"cell_mm": chosen.cell_mm, "hysteresis": chosen.hysteresis})
         added = add_demo(database, asked.recording, cut, actor, read).row
         yield _done("cut", chosen.because, added.sha256)
-        yield _done("report", " ".join(added.report["advice"]) or "Nothing to improve in the recording.")
+        yield _done("report", " ".join(added.report.advice) or "Nothing to improve in the recording.")
         at = "train"
         version, trained = _learn(database, asked, added.sha256, settings, read)
         yield trained
@@ -271,13 +273,13 @@ def _refused(name: StepName, refused: SkillsError, others: Sequence[Choice]) -> 
     return TryStep(name=name, state="refused", text=refused.message, choices=tuple(others), remedies=remedies)
 
 
-def _read_in_words(told: ParsedContent) -> str:
-    about = told.about
+def _read_in_words(parsed: ParsedContent) -> str:
+    about = parsed.about
     motions = "; ".join(
-        f"{one['arm']} in {one['frame']}, {one['samples']} samples at {quality['rate_hz']:.0f} Hz"
-        for one, quality in zip(about["motions"], about["quality"], strict=True)
+        f"{one.arm} in {one.frame}, {one.samples} samples at {quality.rate_hz:.0f} Hz"
+        for one, quality in zip(about.motions, about.quality, strict=True)
     )
-    return f"A recording of {about['duration_s']:.1f} s ({told.recording.format}): {motions}."
+    return f"A recording of {about.duration_s:.1f} s ({parsed.recording.format}): {motions}."
 
 
 def _proposed_in_words(proposed: Sequence[Segment]) -> str:
@@ -314,7 +316,7 @@ def _change(cells: Cells) -> dict[str, Any]:
 
 
 def _learn(
-    database: Database, asked: TryIn, demo: str, settings: Settings, read: Teller
+    database: Database, asked: TryIn, demo: str, settings: Settings, read: Parser
 ) -> tuple[PolicyVersion, TryStep]:
     """Learn and certify a style from a demonstration and store it; return its version, and the step."""
     with database.reading() as session:

@@ -48,7 +48,7 @@ from skills.library.policies.training import (
 )
 from skills.library.policies.versions import LearntIn, Recipe, kept_of, learner_kept, recipes_of, refuse_unlike
 from skills.library.recordings.demos import newest_demos
-from skills.library.recordings.recordings import Teller, confined_reader
+from skills.library.recordings.recordings import Parser, confined_reader
 from skills.schemas.training import FitOnTheSame, PolicyFigures, StoredComparison
 from skills.settings import Settings
 
@@ -145,7 +145,7 @@ class _Batch:
     request: RetrainingRequest
     requested_by: str
     settings: Settings
-    tell: Teller
+    tell: Parser
 
     def training_of(self, style: _Style, demos: Sequence[str], how: Combining | None = None) -> TrainingRequest:
         """Return the request for one style as `request_training` writes it, so that an equal training is recognised."""

@@ -6,9 +6,11 @@ from typing import Any
 
 from skills import __version__
 from skills.db.models import PolicyVersion
-from skills.demonstration.quality import times_in_words
+from skills.demonstration.quality import describe_count
 from skills.gridworld.domain import REACH
 from skills.schemas.cards import Citation, StartCounts
+from skills.schemas.demos import DemoReport
+from skills.schemas.people import Consent
 from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
 USE = "Research use only; not a medical device. Never move an arm by it on or near a person."
@@ -121,15 +123,14 @@ def status(version: int, served: int | None, refused: Sequence[str], was_release
     return f"{before}; of this style, {now} released now."
 
 
-def consent(given: dict[str, Any] | None) -> str:
+def consent(given: Consent | None) -> str:
     """Return the sentence on a surgeon's consent; it does not say whether the consent has expired by now."""
     if given is None:
         return "No consent is recorded here; the study's protocol states the permitted uses."
-    uses = ", ".join(given["uses"]) or "nothing"
-    until = given.get("until")
+    uses = ", ".join(given.uses) or "nothing"
     return (
-        f"Covers {uses}{'' if until is None else f', until {until}'}; other uses are refused. The protocol states "
-        "whether this card may be published."
+        f"Covers {uses}{'' if given.until is None else f', until {given.until}'}; other uses are refused. The protocol "
+        "states whether this card may be published."
     )
 
 
@@ -145,31 +146,31 @@ def demonstration_state(withdrawn_at: datetime | None, outcome: str | None, reas
     )
 
 
-def quality(report: dict[str, Any]) -> list[str]:
+def quality(report: DemoReport) -> list[str]:
     """Return the sentences on a demonstration's quality, and the advice for recording a better one."""
-    smooth, clutched = report["log_dimensionless_jerk"], report["clutch_presses"]
-    size = " x ".join(f"{side:.1f}" for side in report["extent_mm"])
+    smooth, clutched = report.log_dimensionless_jerk, report.clutch_presses
+    size = " x ".join(f"{side:.1f}" for side in report.extent_mm)
     said = [
-        f"{report['duration_s']:.2f} s, {report['samples']} samples at {report['rate_hz']:.0f} Hz; the longest gap is "
-        f"{1000 * report['longest_gap_s']:.0f} ms.",
+        f"{report.duration_s:.2f} s, {report.samples} samples at {report.rate_hz:.0f} Hz; the longest gap is "
+        f"{1000 * report.longest_gap_s:.0f} ms.",
         *_dropped(report),
-        f"The tip moves {report['path_length_mm']:.1f} mm in a box of {size} mm, at {report['speed_median_mm_s']:.1f} "
-        f"mm/s in the median and {report['speed_peak_mm_s']:.1f} mm/s at most; {report['idle_share']:.0%} of the time "
+        f"The tip moves {report.path_length_mm:.1f} mm in a box of {size} mm, at {report.speed_median_mm_s:.1f} "
+        f"mm/s in the median and {report.speed_peak_mm_s:.1f} mm/s at most; {report.idle_share:.0%} of the time "
         "it is idle.",
         "No press of the clutch is recorded."
         if clutched == 0
-        else f"The clutch was pressed {times_in_words(clutched)}, {report['clutched_s']:.1f} s in all.",
+        else f"The clutch was pressed {describe_count(clutched)}, {report.clutched_s:.1f} s in all.",
     ]
     if smooth is not None:
         said.append(
             f"Smoothness (log dimensionless jerk): {smooth:.1f}; one smooth stroke has -5.3, a hesitant motion less."
         )
-    return said + [f"Advice to the surgeon: {one}" for one in report["advice"]]
+    return said + [f"Advice to the surgeon: {one}" for one in report.advice]
 
 
-def _dropped(report: dict[str, Any]) -> list[str]:
+def _dropped(report: DemoReport) -> list[str]:
     """Return the sentence on the samples that were dropped for their stamps; none if there are none."""
-    repeated, back = (report.get(name) or 0 for name in ("duplicate_stamps", "backward_stamps"))
+    repeated, back = (report.duplicate_stamps, report.backward_stamps)
     if not repeated + back:
         return []
     return [
@@ -178,16 +179,16 @@ def _dropped(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def lost(report: dict[str, Any]) -> str:
+def lost(report: DemoReport) -> str:
     """Return the sentences on the precision that a demonstration lost in the grid."""
-    x, y, z = report["discretisation_rmse_mm"]
-    crossings = report["revisits"]
-    crossed = "never crosses itself" if crossings == 0 else f"returns to a state {times_in_words(crossings)}"
-    gaps = report["bridged_cells"]
+    x, y, z = report.discretisation_rmse_mm
+    crossings = report.revisits
+    crossed = "never crosses itself" if crossings == 0 else f"returns to a state {describe_count(crossings)}"
+    gaps = report.bridged_cells
     bridged = "each state has a sample" if gaps == 0 else f"{gaps} of the states have no sample and were bridged"
     return (
-        f"{report['discretisation_rmse_3d_mm']:.2f} mm (RMSE, 3-D; {x:.2f} in x, {y:.2f} in y, {z:.2f} in z). The path "
-        f"has {report['path_states']} states and {crossed}; {bridged}."
+        f"{report.discretisation_rmse_3d_mm:.2f} mm (RMSE, 3-D; {x:.2f} in x, {y:.2f} in y, {z:.2f} in z). The path "
+        f"has {report.path_states} states and {crossed}; {bridged}."
     )
 
 

@@ -24,7 +24,6 @@ from skills.db.models import (
     StoredPlayback,
     StoredRewardMap,
     Surgeon,
-    SutureType,
 )
 from skills.db.packed import digest
 from skills.demonstration.demonstration import Demo
@@ -36,11 +35,11 @@ from skills.learning.certificate import Coverage
 from skills.library.operation.inspection import AGREES
 from skills.library.operation.integrity import covered, learnt, what_identifies
 from skills.library.people import consent
-from skills.library.people.catalogue import find_suture_type
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import card_words as words
 from skills.library.policies import releases
 from skills.library.policies.versions import combined_of, learnt_from
-from skills.library.recordings.demos import full_report
+from skills.library.recordings.reports import full_report
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
 from skills.schemas.cards import (
@@ -58,7 +57,6 @@ from skills.schemas.cards import (
     CardRelease,
     CardStatus,
     CardSurgeon,
-    CardSutureType,
     PolicyCard,
     RestingOnIt,
     StartCounts,
@@ -66,6 +64,7 @@ from skills.schemas.cards import (
     StartShares,
     TipErrors,
 )
+from skills.schemas.people import SutureType
 from skills.transparency.notes import Note
 from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
@@ -121,7 +120,7 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
         policy=_policy(version),
         status=_status(session, version, released),
         surgeon=_surgeon(version.surgeon),
-        suture_type=_suture_type(find_suture_type(session, version.suture)),
+        suture_type=SutureType.model_validate(find_suture_type(session, version.suture)),
         demonstrations=[_demonstration(one) for one in demonstrations],
         combined=combined,
         learner=_learner(version),
@@ -200,16 +199,6 @@ def _surgeon(surgeon: Surgeon) -> CardSurgeon:
         protocol=surgeon.protocol,
         consent=surgeon.consent,
         consent_in_words=words.consent(surgeon.consent),
-    )
-
-
-def _suture_type(suture: SutureType) -> CardSutureType:
-    return CardSutureType(
-        suture=suture.slug,
-        name=suture.name,
-        also_called=suture.also_called,
-        family=suture.family,
-        description=suture.description,
     )
 
 

@@ -42,7 +42,8 @@ from skills.library.policies.training import (
     lessons,
 )
 from skills.library.policies.versions import combining_of
-from skills.library.recordings.recordings import Teller, alike, recording_bytes
+from skills.library.recordings.content_cache import alike
+from skills.library.recordings.recordings import Parser, recording_bytes
 from skills.packing import canonical
 from skills.settings import Settings
 
@@ -134,7 +135,7 @@ def _beside(made: Learnt) -> PartnerMotion | None:
 class StoredRecordings:
     """Reads recordings from their stored bytes; the last one is kept, because versions in turn are often of one."""
 
-    def __init__(self, database: Database, tell: Teller) -> None:
+    def __init__(self, database: Database, tell: Parser) -> None:
         """Read from this database, by a reader that is possibly in another process."""
         self._database, self._tell = database, tell
         self._last: tuple[int, ParsedContent] | None = None
@@ -151,7 +152,7 @@ class StoredRecordings:
         return self._last[1]
 
 
-def decoded(database: Database, row: int, tell: Teller) -> ParsedContent:
+def decoded(database: Database, row: int, tell: Parser) -> ParsedContent:
     """Decode the stored bytes of a recording, whatever is cached of it.
 
     Raises:
@@ -163,9 +164,9 @@ def decoded(database: Database, row: int, tell: Teller) -> ParsedContent:
             stored = session.get(StoredRecording, row)
             if stored is None:
                 raise NotFound("There is no such recording.")
-            reading = stored.reading
+            options = stored.reading.options
             file.writelines(recording_bytes(session, stored))
-        return tell(file, **reading)
+        return tell(file, **options)
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from skills.learning.certificate import NearLimits, OddsLimits
 from skills.learning.policy import LEARNER_VERSION, describe_learner
 from skills.library.operation import jobs, locks
 from skills.library.operation.jobs import BATCH, KEPT, PART, PartRequest, RequestedJob, RetrainingRequest, did_nothing
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import require
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import Outcome
 from skills.library.policies.training import GATE_VERSION, POSES_VERSION, learner_to_train
 from skills.library.policies.versions import Kept, Recipe, in_pieces, kept_of, learner_kept, recipes_of

@@ -69,13 +69,14 @@ from skills.learning.tube import certified_poses
 from skills.library.operation import jobs
 from skills.library.operation.integrity import policy_identity_of, poses_identity_of, scene_digest
 from skills.library.operation.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import refusal, require
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
 from skills.library.policies.releases import driven_or_refused, refusals
 from skills.library.policies.versions import BEST, choose_demos, combining_of, describe_combined, find_by_digest
 from skills.library.recordings.demos import find_demo
-from skills.library.recordings.recordings import Teller, confined_reader, stored_recording
+from skills.library.recordings.recordings import Parser, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass
 from skills.remedies import Action, Remedy
@@ -346,7 +347,7 @@ def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
     ]
 
 
-def with_partners(database: Database, lessons: Sequence[Lesson], tell: Teller) -> list[Lesson]:
+def with_partners(database: Database, lessons: Sequence[Lesson], tell: Parser) -> list[Lesson]:
     """Return lessons of one style with the other arm's motion along each demonstration, if every one has it.
 
     It is computed from the recordings, because a demonstration has only the pose in which the other arm takes the

@@ -35,7 +35,8 @@ from skills.library.operation import integrity
 from skills.library.operation.integrity import covered, learnt, posed
 from skills.library.operation.jobs import KEPT, RetrainingRequest
 from skills.library.people import consent
-from skills.library.people.catalogue import find_surgeon, find_suture_type
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
 from skills.library.policies.releases import is_served
 from skills.library.recordings.demos import find_demo, newest_demos

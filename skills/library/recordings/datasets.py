@@ -28,6 +28,7 @@ from sqlalchemy.orm import Session
 
 from skills.db import in_parts
 from skills.db.models import (
+    CHUNK_BYTES,
     SUCCESS,
     Demonstration,
     StoredRecording,
@@ -60,17 +61,18 @@ from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest
 from skills.library.operation.jobs import EXPORT, UNSYNCHRONISED, DatasetRequest, Store
 from skills.library.people import consent
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import RECORDED, episodes_of, overlap, recorded_in
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.recordings.demos import find_demo
-from skills.library.recordings.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
+from skills.library.recordings.recordings import Parser, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
-from skills.schemas.datasets import DatasetIn
+from skills.schemas.datasets import DatasetEpisode, DatasetEpisodes, DatasetIn
 from skills.settings import Settings
 
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once
-TOLD_S = 0.5  # progress is stored about so often, each time in a transaction
+PROGRESS_S = 0.5  # progress is stored about so often, each time in a transaction
 
 _EXPORTED, _DEMOS = (cast(Table, one.__table__).alias() for one in (DatasetDemonstration, Demonstration))
 EPISODE = (_DEMOS.c.recording_row, _DEMOS.c.surgeon_row, _DEMOS.c.start_s, _DEMOS.c.end_s)
@@ -124,7 +126,7 @@ def request_dataset(session: Session, asked: DatasetIn, actor: str) -> tuple[Job
         "licence": asked.licence,
         "description": asked.description,
         "procedure": asked.procedure,
-        "consent": consents_in_words(recorded.surgeons),
+        "consent": describe_consents(recorded.surgeons),
         "episodes": len({one.recording_row for one in chosen}) if asked.whole else len(chosen),
         "demos_sha256": sha256(canonical([[one.sha256, splits[one.row]] for one in chosen])),
     }
@@ -216,8 +218,8 @@ def _arms(session: Session, chosen: Sequence[_Chosen], wanted: list[str] | None)
     common: set[str] | None = None
     of = StoredRecording
     for some in in_parts(sorted({one.recording_row for one in chosen})):
-        for name, motions in session.execute(select(of.sha256, of.about["motions"]).where(of.row.in_(some))):
-            arms = {motion["arm"] for motion in motions}
+        for name, about in session.execute(select(of.sha256, of.about).where(of.row.in_(some))):
+            arms = {motion.arm for motion in about.motions}
             if missing := {*(wanted or ())} - arms:
                 arm = sorted(missing)[0]
                 raise BadInput(f"The recording {name[:12]} has no pose of {arm}; leave out one of the two.")
@@ -247,7 +249,7 @@ def require_exportable(session: Session, job: Job) -> list[Surgeon]:
     return recorded.surgeons
 
 
-def consents_in_words(surgeons: Sequence[Surgeon]) -> str:
+def describe_consents(surgeons: Sequence[Surgeon]) -> str:
     """Return the consents of some surgeons as sentences for a README, without their pseudonyms."""
     agreed = [one for one in surgeons if one.consent is not None]
     ends = [day for one in agreed if (day := consent.last_day(one.consent)) is not None]
@@ -377,14 +379,14 @@ def _episodes(session: Session, job_row: int) -> list[_Episode]:
 
 
 def _exported(
-    database: Database, read: Teller, episodes: Sequence[_Episode], tell: Callable[[float], None]
+    database: Database, read: Parser, episodes: Sequence[_Episode], tell: Callable[[float], None]
 ) -> Iterator[ExportedEpisode]:
     """Read the recordings one after another, and yield their episodes."""
     at, recording, due_s = None, None, 0.0
     for number, episode in enumerate(episodes):
         if (now_s := monotonic()) >= due_s:
             tell(number / (len(episodes) + 1))
-            due_s = now_s + TOLD_S
+            due_s = now_s + PROGRESS_S
         if recording is None or at != episode.recording:
             recording = None  # before the next one is read, so that only one is in memory
             try:
@@ -442,13 +444,13 @@ def find_dataset(session: Session, dataset_sha256: str) -> StoredDataset:
     return find_by_digest(session, StoredDataset, dataset_sha256, "dataset", Remedy(Action.LIST_DATASETS))
 
 
-def episodes_json(session: Session, dataset_sha256: str) -> dict[str, Any]:
+def episodes_of_dataset(session: Session, dataset_sha256: str) -> DatasetEpisodes:
     """Return the recording and the demonstrations of each episode of a dataset, in the order of their numbers."""
     found = _episodes(session, find_dataset(session, dataset_sha256).job_row)
-    return {
-        "whole": all(one.interval_s is None for one in found),
-        "episodes": [{"recording": one.recording, "demos": list(one.demos)} for one in found],
-    }
+    return DatasetEpisodes(
+        whole=all(one.interval_s is None for one in found),
+        episodes=[DatasetEpisode(recording=one.recording, demos=list(one.demos)) for one in found],
+    )
 
 
 def served_dataset(session: Session, dataset_sha256: str) -> StoredDataset:

@@ -3,16 +3,15 @@
 recording, DemoIn --make_demo--> Made --upload_demo, add_demo--> Added
 """
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple, cast
+from dataclasses import dataclass
+from typing import NamedTuple, cast
 
 import numpy as np
 from sqlalchemy import Table, select
 from sqlalchemy.orm import Session
 
-from skills.db import now, rfc3339
+from skills.db import now
 from skills.db.models import (
     Demonstration,
     DemonstrationOutcome,
@@ -25,37 +24,32 @@ from skills.db.packed import digest
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
-from skills.demonstration.quality import describe
-from skills.demonstration.recording import equal_samples
-from skills.demonstration.segments import Segment, TakenSegment
-from skills.errors import BadSegment, Conflict, SegmentNotNamed
-from skills.fields import as_json
-from skills.formats.parsed import MOST, ParsedContent, parse_recording
-from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, describe_path, discretize
-from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.errors import Conflict
+from skills.formats.parsed import ParsedContent, parse_recording
+from skills.gridworld import reward
+from skills.gridworld.grid import GridPath, choose_grid, discretize
+from skills.gridworld.reward import sparse_reward
 from skills.library.operation import locks
 from skills.library.operation.integrity import demo_identity, find_by_digest
 from skills.library.people import consent
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import episodes_of, in_recording, recorded_in
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import withdraw_failed, withdraw_resting_on
+from skills.library.recordings.parts import choose_part
 from skills.library.recordings.recordings import (
-    Teller,
+    Parser,
     Upload,
-    cache_large,
-    entry_of,
     find_recording,
-    keep,
-    send_ahead,
+    parse_upload,
     stored_recording,
-    tell_upload,
+    storing,
 )
-from skills.packing import canonical
+from skills.library.recordings.reports import report_on
 from skills.remedies import Action, Remedy
-from skills.schemas import ChosenGrid, DemoOutcome, OutcomeAsked
-from skills.schemas.demos import DemoIn, DemoReport
+from skills.schemas import DemoOutcome, OutcomeAsked
+from skills.schemas.demos import ChosenSegment, DemoIn, DemoPath, DemoReport, RewardMap
 
-EQUAL_SHARE = 0.1  # ours: an arm that rests on exact encoder values for a tenth of the time is no reason for advice
 # The actions of the events that mark an outcome.
 MARKS: dict[DemoOutcome, str] = {
     "success": "mark-success",
@@ -70,9 +64,9 @@ class Made:
 
     demo: Demo
     path: GridPath
-    reward: RewardMap
-    report: dict[str, Any]
-    taken: TakenSegment
+    reward: reward.RewardMap
+    report: DemoReport
+    segment: ChosenSegment
 
 
 class Added(NamedTuple):
@@ -80,140 +74,26 @@ class Added(NamedTuple):
 
     row: Demonstration
     new: bool
-    taken: TakenSegment
+    segment: ChosenSegment
 
 
-def make_demo(told: ParsedContent, cut: DemoIn) -> Made:
+def make_demo(parsed: ParsedContent, cut: DemoIn) -> Made:
     """Cut a hand-off out of a recording and put it into its grid world.
 
     Raises:
         SegmentNotNamed: Several hand-offs are proposed, and the request names none.
         BadSegment: The part is named in two ways, or there is no such proposal.
     """
-    recording = told.recording
-    part, what, because = choose_part(told, cut)
+    recording = parsed.recording
+    part, name, because = choose_part(parsed, cut)
     demo = cut_demo(recording, arm=part.arm, topic=part.topic, start_s=part.start_s, end_s=part.end_s)
-    grid = choose_grid(demo.tip_mm, cut.grid, cut.cell_mm)
-    path = discretize(demo.tip_mm, grid, cut.hysteresis)
+    path = discretize(demo.tip_mm, choose_grid(demo.tip_mm, cut.grid, cut.cell_mm), cut.hysteresis)
     motion = recording.motion_of(arm=demo.arm, topic=demo.topic)
-    taken = TakenSegment(what, demo.start_s, demo.end_s, because)
-    report = report_on(demo, path, motion.duplicate_stamps, motion.backward_stamps) | {"segment": asdict(taken)}
-    return Made(demo, path, sparse_reward(path), report, taken)
+    report = report_on(demo, path, motion.duplicate_stamps, motion.backward_stamps)
+    return Made(demo, path, sparse_reward(path), report, ChosenSegment(name, demo.start_s, demo.end_s, because))
 
 
-def choose_part(told: ParsedContent, cut: DemoIn) -> tuple[DemoIn, str, str]:
-    """Return the request with the times of the part to cut, the name of that part, and the reason for the choice.
-
-    Raises:
-        SegmentNotNamed: Several hand-offs are proposed, and the request names none.
-        BadSegment: The part is named in two ways, or there is no such proposal.
-    """
-    timed = cut.start_s is not None or cut.end_s is not None
-    if timed and cut.segment is not None:
-        raise BadSegment("Choose the part by segment, or by start_s and end_s, but not by both.")
-    if timed:
-        return cut, "the given times", "start_s or end_s was given"
-    if cut.segment == "whole":
-        return cut, "the whole recording", "segment=whole was given"
-    proposed = _proposed(told, cut)
-    if isinstance(cut.segment, int):
-        if not 1 <= cut.segment <= len(proposed):
-            raise BadSegment(f"There is no proposal {cut.segment}. {_listed(proposed)}", segments=_numbered(proposed))
-        return _proposal(cut, proposed, cut.segment)
-    if not proposed:
-        return cut, "the whole recording", "no hand-off is proposed in it; check that it holds exactly one"
-    if len(proposed) > 1:
-        raise SegmentNotNamed(_listed(proposed), Remedy(Action.NAME_SEGMENT), segments=_numbered(proposed))
-    return _proposal(cut, proposed, 1)
-
-
-def _proposed(told: ParsedContent, cut: DemoIn) -> list[Segment]:
-    """Return the proposals that match the request's arm and topic, in the order in which the recording lists them."""
-    fitting = {m.arm for m in told.recording.motions if cut.arm in (None, m.arm) and cut.topic in (None, m.topic)}
-    return [one for one in told.proposed if one.arm in fitting]
-
-
-def _proposal(cut: DemoIn, proposed: Sequence[Segment], number: int) -> tuple[DemoIn, str, str]:
-    one = proposed[number - 1]
-    part = cut.model_copy(update={"arm": one.arm, "start_s": one.start_s, "end_s": one.end_s})
-    why = "it is the only one" if cut.segment is None else f"segment={number} was given"
-    return part, f"proposal {number} of {len(proposed)}", f"{why}: {one.reason}"
-
-
-def _numbered(proposed: Sequence[Segment]) -> list[dict[str, Any]]:
-    """Return proposals with their numbers as JSON, the first `MOST`."""
-    return [
-        {"segment": number, "arm": one.arm, "start_s": one.start_s, "end_s": one.end_s, "reason": one.reason}
-        for number, one in enumerate(proposed[:MOST], 1)
-    ]
-
-
-def _listed(proposed: Sequence[Segment]) -> str:
-    """Return a sentence that lists the proposals, the first ten with their times."""
-    if not proposed:
-        return "No hand-off is proposed in this recording."
-    shown = [f"{n}: {one.arm}, {one.start_s:.2f} to {one.end_s:.2f} s" for n, one in enumerate(proposed[:10], 1)]
-    rest = "; ..." if len(proposed) > len(shown) else ""
-    are = "1 hand-off is" if len(proposed) == 1 else f"{len(proposed)} hand-offs are"
-    return f"{are} proposed in this recording ({'; '.join(shown)}{rest})."
-
-
-def report_on(demo: Demo, path: GridPath, duplicate_stamps: int, backward_stamps: int) -> dict[str, Any]:
-    """Return the measurements of a demonstration and its path as JSON, with advice to the surgeon.
-
-    Args:
-        demo: The demonstration.
-        path: Its path in the grid.
-        duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
-        backward_stamps: Samples of the entire recorded motion that were dropped because their stamp went back.
-    """
-    of_motion, of_path = describe(demo), describe_path(demo, path)
-    equal = equal_samples(demo.tip_mm, demo.rotation_xyzw)
-    chosen = "paper" if path.grid == PAPER_GRID else "fit"
-    more = {
-        "duplicate_stamps": duplicate_stamps,
-        "backward_stamps": backward_stamps,
-        "equal_samples": equal,
-        "grid": ChosenGrid(**asdict(path.grid), chosen=chosen),
-        "partner": demo.partner,
-        "advice": (
-            *of_motion.advice,
-            *_about_stamps(duplicate_stamps, "repeated the previous stamp and were dropped"),
-            *_about_stamps(backward_stamps, "had a stamp that went back and were dropped"),
-            *_about_equal(equal, len(demo.tip_mm)),
-            *of_path.advice,
-        ),
-    }
-    report = DemoReport(**vars(of_motion) | vars(of_path) | more)
-    written: dict[str, Any] = json.loads(canonical(as_json(report)))
-    return written  # canonical JSON and back: the same value as when it is read from the database
-
-
-def full_report(demonstration: Demonstration) -> dict[str, Any]:
-    """Measure a stored demonstration again, because no digest covers its stored report."""
-    about, topic = demonstration.recording.about, demonstration.topic
-    duplicates = next((m["duplicate_stamps"] for m in about["motions"] if m["topic"] == topic), 0)
-    backward = next((one["backward_stamps"] for one in about["dropped"] if one["topic"] == topic), 0)
-    return report_on(demonstration.demo, demonstration.path, duplicates, backward)
-
-
-def _about_stamps(count: int, what: str) -> list[str]:
-    if count == 0:
-        return []
-    samples = "1 sample" if count == 1 else f"{count} samples"
-    return [f"{samples} {what}: check the recorder's clock."]
-
-
-def _about_equal(count: int, samples: int) -> list[str]:
-    if count <= EQUAL_SHARE * samples:
-        return []
-    return [
-        f"{count} of {samples} samples ({count / samples:.0%}) repeat the pose of the sample before: the recorder was "
-        "faster than its source, so speeds are less certain than the rate suggests."
-    ]
-
-
-def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, read: Teller = parse_recording) -> Added:
+def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, parse: Parser = parse_recording) -> Added:
     """Store a recording and one demonstration of it, both or neither.
 
     Args:
@@ -221,35 +101,35 @@ def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, rea
         upload: The recording's bytes.
         cut: The demonstration to cut out of it.
         actor: The owner of the caller's key.
-        read: The reader, possibly in another process.
+        parse: The reader, possibly in another process.
 
     Raises:
-        SkillsError: As in `make_demo` and `skills.library.recordings.demos.tell_upload`.
+        SkillsError: As in `make_demo` and `skills.library.recordings.recordings.parse_upload`.
     """
-    with database.reading() as session:  # fails early, before the long computation; looked up again when writing
-        find_surgeon(session, cut.surgeon)
-        find_suture_type(session, cut.suture)
-    told = tell_upload(upload, read)
-    made, entry = make_demo(told, cut), entry_of(upload, told)
-    ahead = send_ahead(database, upload)
-    with database.writing([locks.recording(upload.sha256), locks.surgeon(cut.surgeon)]) as session:
-        stored, _ = keep(session, upload, told, entry, actor, ahead)
-        added = _store_demo(session, stored, made, cut, actor)
-    cache_large(database, stored, entry)
-    return added
+    _check_style(database, cut)
+    parsed = parse_upload(upload, parse)
+    made = make_demo(parsed, cut)
+    with storing(database, upload, parsed, actor, [locks.surgeon(cut.surgeon)]) as (session, stored, _):
+        return _store_demo(session, stored, made, cut, actor)
 
 
 def add_demo(
-    database: Database, recording_sha256: str, cut: DemoIn, actor: str, read: Teller = parse_recording
+    database: Database, recording_sha256: str, cut: DemoIn, actor: str, parse: Parser = parse_recording
 ) -> Added:
     """Cut another demonstration out of a stored recording; it raises the errors of `make_demo` as well."""
+    _check_style(database, cut)
+    with database.reading() as session:
+        recording_sha256 = find_recording(session, recording_sha256).sha256  # in full: the argument may be a prefix
+    made = make_demo(stored_recording(database, recording_sha256, parse, intact=True), cut)
+    with database.writing([locks.recording(recording_sha256), locks.surgeon(cut.surgeon)]) as session:
+        return _store_demo(session, find_recording(session, recording_sha256), made, cut, actor)
+
+
+def _check_style(database: Database, cut: DemoIn) -> None:
+    """Fail early, before the long computation; both are looked up again when writing."""
     with database.reading() as session:
         find_surgeon(session, cut.surgeon)
         find_suture_type(session, cut.suture)
-        recording_sha256 = find_recording(session, recording_sha256).sha256  # in full: the argument may be a prefix
-    made = make_demo(stored_recording(database, recording_sha256, read, intact=True), cut)
-    with database.writing([locks.recording(recording_sha256), locks.surgeon(cut.surgeon)]) as session:
-        return _store_demo(session, find_recording(session, recording_sha256), made, cut, actor)
 
 
 def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: DemoIn, actor: str) -> Added:
@@ -261,7 +141,7 @@ def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: Demo
         if known.withdrawn_at is not None:
             raise Conflict("This demonstration was withdrawn; record another, or cut another part of the recording.")
         _refuse_other_outcome(known, cut)
-        return Added(known, False, made.taken)
+        return Added(known, False, made.segment)
     demonstration = Demonstration(
         sha256=demo_sha256,
         recording=stored,
@@ -278,6 +158,7 @@ def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: Demo
         demo=made.demo,
         path=made.path,
         report=made.report,
+        segment=made.segment,
     )
     session.add(demonstration)
     session.flush()
@@ -286,7 +167,7 @@ def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: Demo
     )
     record_event(session, actor, "add", "demonstration", demo_sha256, surgeon)
     _mark(session, demonstration, cut.outcome, cut.outcome_reason, actor)
-    return Added(demonstration, True, made.taken)
+    return Added(demonstration, True, made.segment)
 
 
 def _refuse_other_outcome(known: Demonstration, cut: DemoIn) -> None:
@@ -459,58 +340,31 @@ def _mark(
     session.refresh(demonstration, ["outcome", "outcome_reason"])
 
 
-def demo_json(row: Demonstration, taken: TakenSegment | None = None) -> dict[str, Any]:
-    """Return a demonstration's JSON, with the part of the recording that was taken by this call, else as stored."""
-    report = dict(row.report)
-    stored = report.pop("segment")
-    return {
-        "id": row.sha256,
-        "sha256": row.sha256,
-        "recording": row.recording.sha256,
-        "surgeon": row.surgeon.slug,
-        "suture": row.suture,
-        "arm": row.arm,
-        "topic": row.topic,
-        "frame": row.frame,
-        "instrument": row.instrument,
-        "start_s": row.start_s,
-        "end_s": row.end_s,
-        "segment": stored if taken is None else asdict(taken),
-        "session": row.session,
-        "hysteresis": row.hysteresis,
-        "state": "active" if row.withdrawn_at is None else "withdrawn",
-        "outcome": row.outcome,
-        "outcome_reason": row.outcome_reason,
-        "report": report,
-        "created_at": rfc3339(row.created_at),
-        "withdrawn_at": rfc3339(row.withdrawn_at),
-    }
-
-
-def path_json(row: Demonstration) -> dict[str, Any]:
-    """Return the JSON of a demonstration's path: its states and its recorded motion."""
+def path_of_demo(row: Demonstration) -> DemoPath:
+    """Return a demonstration's path: its states and its recorded motion."""
     path, recorded = row.path, row.demo
-    return {
-        "demo": row.sha256,
-        "frame": row.frame,
-        "grid": row.report["grid"],
-        "hysteresis": path.hysteresis,
-        "states": path.states.tolist(),
-        "path_mm": path.tip_mm.tolist(),
-        "stamps_s": recorded.stamps_s.tolist(),
-        "recorded_mm": recorded.tip_mm.tolist(),
-    }
+    return DemoPath(
+        demo=row.sha256,
+        frame=row.frame,
+        grid=row.report.grid,
+        hysteresis=path.hysteresis,
+        states=path.states.tolist(),
+        path_mm=path.tip_mm.tolist(),
+        stamps_s=recorded.stamps_s.tolist(),
+        recorded_mm=recorded.tip_mm.tolist(),
+    )
 
 
-def reward_map_json(row: Demonstration, kept: StoredRewardMap) -> dict[str, Any]:
-    """Return the JSON of a reward map: the states whose reward is not `other`."""
-    rewards, levels = kept.map.rewards, kept.map.levels
+def reward_map_of(session: Session, row: Demonstration) -> RewardMap:
+    """Return the reward map of a demonstration: the states whose reward is not `other`."""
+    stored = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == row.row)).one()
+    rewards, levels = stored.map.rewards, stored.map.levels
     special = np.flatnonzero(rewards != levels.other)
-    return {
-        "demo": row.sha256,
-        "sha256": kept.sha256,
-        "grid": row.report["grid"],
-        "levels": asdict(levels),
-        "states": special.tolist(),
-        "rewards": rewards[special].tolist(),
-    }
+    return RewardMap(
+        demo=row.sha256,
+        sha256=stored.sha256,
+        grid=row.report.grid,
+        levels=levels,
+        states=special.tolist(),
+        rewards=rewards[special].tolist(),
+    )

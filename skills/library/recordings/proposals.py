@@ -19,17 +19,19 @@ import numpy as np
 from sqlalchemy import Row, Select, or_, select
 from sqlalchemy.orm import Session
 
-from skills.db import rfc3339
 from skills.db.models import Demonstration, ErasedInterval, ProposalMark, RecordingSurgeon, StoredRecording, Surgeon
 from skills.db.service_tables import record_event
 from skills.db.session import Database
+from skills.demonstration.segments import Segment
 from skills.errors import Conflict, NotFound
 from skills.formats.parsed import MOST
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import shown_recording
-from skills.library.recordings.recordings import Teller, find_recording
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
+from skills.library.recordings.recordings import Parser, find_recording
 from skills.remedies import Action, Remedy
 from skills.schemas import ProposalDecision, ProposalState
+from skills.schemas import demos as described
 
 SHARED = 0.5  # of the longer of proposal and cut: a corrected proposal is still the same, a cut of all hand-offs is not
 AT_ONCE, LOOKED_AT = 50, 500  # recordings: read by one query, and read for one page at most
@@ -45,7 +47,7 @@ class Proposal:
     Attributes:
         recording: The row of its recording, or columns of it.
         number: Its number in the recording, from 1.
-        segment: The segment as it was stored, which `demonstration.segments.Segment` describes.
+        segment: The segment as it was stored.
         surgeon: The surgeon of its demonstration, else the only one that the recording was uploaded for.
         demo: The demonstration that was cut there, as columns of its row; None if none was.
         mark: The newest decision on it; None if there is none.
@@ -53,7 +55,7 @@ class Proposal:
 
     recording: Any
     number: int
-    segment: dict[str, Any]
+    segment: Segment
     surgeon: str | None
     demo: Any
     mark: ProposalMark | None
@@ -98,7 +100,7 @@ def list_proposals(
         The proposals, and the cursor of the next page; None if there is none.
     """
     of, cut = StoredRecording, Demonstration
-    query: Select[Any] = select(of.row, of.sha256, of.about, of.created_at)
+    query: Select[*tuple[Any, ...]] = select(of.row, of.sha256, of.about, of.created_at)
     if recording is not None:
         query = query.where(of.row == find_recording(session, recording).row)
     if surgeon is not None:
@@ -145,7 +147,7 @@ def find_proposal(session: Session, recording: str, number: int) -> Proposal:
     stored = find_recording(session, recording)
     one = next((one for one in _proposals_in(session, [stored]) if one.number == number), None)
     if one is None:
-        count = len(stored.about["segments"])
+        count = len(stored.about.segments)
         raise NotFound(
             f"There is no proposal {number} in this recording; it has {count}.", Remedy(Action.LIST_PROPOSALS)
         )
@@ -171,24 +173,23 @@ def _proposals_in(session: Session, recordings: Sequence[Any]) -> Iterator[Propo
     all_marks = session.scalars(select(marked).where(marked.recording_row.in_(rows)).order_by(marked.row))
     marks = {(one.recording_row, one.number): one for one in all_marks}  # the newest of each
     for one in recordings:
-        for number, segment in enumerate(one.about["segments"], 1):
+        for number, segment in enumerate(one.about.segments, 1):
             demo = _cut_there(segment, demos[one.row])
             theirs = owners[one.row] if demo is None else {demo.surgeon_row}
             surgeon = slugs.get(next(iter(theirs))) if len(theirs) == 1 else None
             yield Proposal(one, number, segment, surgeon, demo, marks.get((one.row, number)))
 
 
-def _cut_there(segment: dict[str, Any], demos: Sequence[Any]) -> Any:
+def _cut_there(segment: Segment, demos: Sequence[Any]) -> Any:
     """Return the demonstration that was cut at a proposal, an active one first and of those the newest."""
-    there = [one for one in demos if one.arm == segment["arm"] and _same(segment, one)]
+    there = [one for one in demos if one.arm == segment.arm and _same(segment, one)]
     active = [one for one in there if one.withdrawn_at is None]
     return next(reversed(active or there), None)
 
 
-def _same(segment: dict[str, Any], cut: Any) -> bool:
-    start_s, end_s = segment["start_s"], segment["end_s"]
-    shared_s = min(end_s, cut.end_s) - max(start_s, cut.start_s)
-    return bool(shared_s >= SHARED * max(end_s - start_s, cut.end_s - cut.start_s))
+def _same(segment: Segment, cut: Any) -> bool:
+    shared_s = min(segment.end_s, cut.end_s) - max(segment.start_s, cut.start_s)
+    return bool(shared_s >= SHARED * max(segment.end_s - segment.start_s, cut.end_s - cut.start_s))
 
 
 def decide(
@@ -222,35 +223,40 @@ def decide(
     return find_proposal(session, recording, number)
 
 
-def proposal_json(one: Proposal) -> dict[str, Any]:
-    """Return a proposal's JSON."""
+def describe_proposal(one: Proposal) -> described.Proposal:
+    """Return a proposal as it is sent to clients."""
     demo, segment = one.demo, one.segment
     note = one.mark.note if one.mark is not None and one.state == "rejected" else None
-    return {
-        "recording": one.recording.sha256,
-        "number": one.number,
-        "state": one.state,
-        **{name: segment[name] for name in ("arm", "start_s", "end_s", "handover_s", "found_by", "reasons")},
-        "confidence": segment.get("confidence"),
-        "surgeon": one.surgeon,
-        "suture": None if demo is None else demo.suture,
-        "demo": None if demo is None else demo.sha256,
-        "outcome": None if demo is None else demo.outcome,
-        "note": note if demo is None else demo.outcome_reason,
-        "created_at": rfc3339(one.recording.created_at),
-    }
+    return described.Proposal(
+        recording=one.recording.sha256,
+        number=one.number,
+        state=one.state,
+        arm=segment.arm,
+        start_s=segment.start_s,
+        end_s=segment.end_s,
+        handover_s=segment.handover_s,
+        found_by=segment.found_by,
+        reasons=list(segment.reasons),
+        confidence=segment.confidence,
+        surgeon=one.surgeon,
+        suture=None if demo is None else demo.suture,
+        demo=None if demo is None else demo.sha256,
+        outcome=None if demo is None else demo.outcome,
+        note=note if demo is None else demo.outcome_reason,
+        created_at=one.recording.created_at,
+    )
 
 
-def paths_of(database: Database, recording: str, tell: Teller) -> list[list[list[float]]]:
+def paths_of(database: Database, recording: str, parse: Parser) -> list[list[list[float]]]:
     """Return the path of the tip in each proposal of a recording, at most `POINTS` points of it in mm, for pictures."""
     with database.reading() as session:
-        segments = find_recording(session, recording).about["segments"]
-    told = shown_recording(database, recording, tell).recording
-    motions = {arm: told.motion_of(arm=arm) for arm in {one["arm"] for one in segments}}
+        segments = find_recording(session, recording).about.segments
+    shown = shown_recording(database, recording, parse).recording
+    motions = {arm: shown.motion_of(arm=arm) for arm in {one.arm for one in segments}}
     paths = []
     for one in segments:
-        motion = motions[one["arm"]]
-        first, last = np.searchsorted(told.seconds(motion.stamps_ns), [one["start_s"], one["end_s"]])
+        motion = motions[one.arm]
+        first, last = np.searchsorted(shown.seconds(motion.stamps_ns), [one.start_s, one.end_s])
         inside = motion.tip_mm[first : max(last, first + 2)]
         at = np.linspace(0, len(inside) - 1, min(POINTS, len(inside))).round().astype(int)
         paths.append(np.round(inside[at], 2).tolist())

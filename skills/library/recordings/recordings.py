@@ -1,38 +1,27 @@
-"""Recordings: raw files, read and checked before any transaction, stored in chunks of 1 MiB; and their content, cached.
+"""Recordings: raw files, read and checked before any transaction, and stored in chunks of 1 MiB.
 
-    file --Upload--> read_upload, tell_upload --keep--> StoredRecording, chunks --stored_recording--> ParsedContent
-    ParsedContent --entry_of--> Entry --put_entry--> rows --cached_content--> ParsedContent
-
-Decoding a bag takes up to a second of processor time per MiB, reading the entry of its content takes a millisecond. The
-bytes remain the truth: an entry is used only if `READER_VERSION`, the reading parameters and its SHA-256 agree, and its
-values pass the checks of their constructors again. Any other is decoded again and replaced, so a row may be missing,
-outdated or deleted at any time. `skills verify` compares entries with their recordings decoded again.
-
-The entry of a recording is visible and erased with it. Backups leave entries out: they are computed from the bytes.
+Upload --parse_upload--> ParsedContent --put_recording--> StoredRecording, chunks --stored_recording--> ParsedContent
 """
 
 import base64
 import hashlib
-import io
-import logging
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from functools import partial
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
-import numpy as np
 from sqlalchemy import delete, select, text, update
 from sqlalchemy.orm import Session
 
-from skills import packing
-from skills.db import now, rfc3339
+from skills.db import now
 from skills.db.models import (
+    AT_ONCE_BYTES,
+    CHUNK_BYTES,
     LooseChunks,
-    ParsedChunk,
-    ParsedRecording,
     RecordingChunk,
     RecordingSurgeon,
     RecordingUpload,
@@ -43,36 +32,32 @@ from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
-from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
 from skills.formats.parsed import ParsedContent, parse_recording
-from skills.formats.reader_process import KNOWN, READER_VERSION, ConfinedReader
+from skills.formats.reader_process import ConfinedReader
 from skills.library.operation import locks
 from skills.library.operation.integrity import find_by_digest
-from skills.library.people.catalogue import find_surgeon
-from skills.packing import canonical
+from skills.library.people.surgeons import find_surgeon
+from skills.library.recordings.content_cache import (
+    Entry,
+    cache_content,
+    cached_content,
+    entry_of,
+    is_cached,
+    put_entry,
+)
 from skills.remedies import Action, Remedy
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import refuse_uncontained
-from skills.schemas.recordings import Reading
+from skills.schemas import recordings as described
+from skills.schemas.recordings import TableIn
 from skills.settings import Settings
 
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
-Teller = Callable[..., ParsedContent]  # `parse_recording`, or a callable that runs it in another process
+Parser = Callable[..., ParsedContent]  # `parse_recording`, or a callable that runs it in another process
 BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
 
-CHUNK_BYTES = 1 << 20
-# Ours: that many bytes are stored in one transaction, for which others wait: on SQLite some 40 ms.
-AT_ONCE_BYTES = 4 * CHUNK_BYTES
 DUE_S = 3600.0  # ours: an upload under way stores its next piece within seconds
-UNFINISHED = 0  # version of an entry whose chunks are not all stored
-# Ours: a larger entry is not kept, so that uploads which compress well cannot fill the disk. Entries of bags, tables
-# and JIGSAWS take 0.1 to 1.1 times the bytes of their files, those of parquet files in single precision 1.6 times.
-MOST_SHARE = 4
-LEAST_BYTES = 256 << 10  # ours: the limit for the smallest files, whose names weigh more than their numbers
-TOLERANCE = 1e-6  # ours, in mm, rad and s: another build of numpy may round differently
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -84,20 +69,11 @@ class Upload:
     size_bytes: int
     media_type: str
     vouched: bool = False  # the client sent a Content-Digest, and it matches the bytes
-    reading: dict[str, Any] = field(default_factory=lambda: Reading().said)
+    reading: TableIn = field(default_factory=TableIn)
 
-    def read_as(self, reading: dict[str, Any]) -> "Upload":
-        """Return the upload with the reader's arguments."""
-        return replace(self, reading=reading)
-
-
-@dataclass(frozen=True, eq=False)
-class Entry:
-    """The content of a recording, serialised: columns of `ParsedRecording`, and the data of its chunks."""
-
-    reading: str
-    sha256: str
-    data: memoryview
+    def read_as(self, stated: TableIn) -> "Upload":
+        """Return the upload with the reading parameters of a request, which may state more than these."""
+        return replace(self, reading=TableIn(**stated.model_dump(include={*TableIn.model_fields})))
 
 
 def check_digest(header: str | None, of_bytes: str) -> bool:
@@ -128,17 +104,17 @@ def read_upload(upload: Upload, read: Reader = read_recording) -> Recording:
         UnknownFormat: Its content is not of the media type of the request.
     """
     _check_type(upload)
-    recording = read(upload.file, **upload.reading)
+    recording = read(upload.file, **upload.reading.options)
     _check_vouched(upload, recording)
     return recording
 
 
-def tell_upload(upload: Upload, tell: Teller = parse_recording) -> ParsedContent:
+def parse_upload(upload: Upload, parse: Parser = parse_recording) -> ParsedContent:
     """Read and check a recording, and derive the proposed hand-offs and its description; it raises as `read_upload`."""
     _check_type(upload)
-    told = tell(upload.file, **upload.reading)
-    _check_vouched(upload, told.recording)
-    return told
+    parsed = parse(upload.file, **upload.reading.options)
+    _check_vouched(upload, parsed.recording)
+    return parsed
 
 
 def _check_type(upload: Upload) -> None:
@@ -158,71 +134,83 @@ def _check_vouched(upload: Upload, recording: Recording) -> None:
 
 
 def store_recording(
-    database: Database, upload: Upload, actor: str, read: Teller = parse_recording, surgeon: str | None = None
+    database: Database, upload: Upload, actor: str, parse: Parser = parse_recording, surgeon: str | None = None
 ) -> tuple[StoredRecording, bool]:
     """Store a recording once, under a surgeon if one is named; return the row, and whether it is new."""
     if surgeon is not None:
         with database.reading() as session:  # fails early, before the long reading; looked up again when writing
             find_surgeon(session, surgeon)
-    told = tell_upload(upload, read)
-    entry = entry_of(upload, told)
     names = [] if surgeon is None else [locks.surgeon(surgeon)]
-    ahead = send_ahead(database, upload)
-    with database.writing([locks.recording(upload.sha256), *names]) as session:
-        stored, new = keep(session, upload, told, entry, actor, ahead)
+    with storing(database, upload, parse_upload(upload, parse), actor, names) as (session, stored, new):
         if surgeon is not None:
             session.merge(RecordingSurgeon(recording_row=stored.row, surgeon_row=find_surgeon(session, surgeon).row))
-    cache_large(database, stored, entry)
     return stored, new
 
 
-def preview(upload: Upload, read: Teller = parse_recording) -> dict[str, Any]:
-    """Return what would be understood of a recording, as JSON; nothing is stored.
+@contextmanager
+def storing(
+    database: Database, upload: Upload, parsed: ParsedContent, actor: str, names: Sequence[str] = ()
+) -> Iterator[tuple[Session, StoredRecording, bool]]:
+    """Store a recording and cache its content; yield the transaction, the row, and whether it is new to the actor.
+
+    Args:
+        database: The database.
+        upload: The recording's bytes.
+        parsed: Their content.
+        actor: The owner of the caller's key.
+        names: Further names that the transaction locks, see `skills.library.operation.locks`.
+
+    Raises:
+        Conflict: The bytes are already stored with other reading parameters.
+    """
+    entry = entry_of(upload, parsed)
+    ahead = send_ahead(database, upload)
+    with database.writing([locks.recording(upload.sha256), *names]) as session:
+        stored, new = put_recording(session, upload, parsed, entry, actor, ahead)
+        yield session, stored, new
+    if entry is not None and entry.is_large:
+        cache_content(database, stored, entry)
+
+
+def preview(upload: Upload, parse: Parser = parse_recording) -> described.RecordingPreview:
+    """Return what would be understood of a recording; nothing is stored.
 
     A table without times is counted, one second for each sample, and its durations and rates are null.
 
     Raises:
         BadRecording, UnknownFormat: As in `read_upload`.
     """
-    told = tell_upload(upload, partial(read, untimed=True))
-    timed = told.recording.is_timed or upload.reading["rate_hz"] is not None
-    about = told.about if timed else _untimed(told.about)
-    return {
-        "sha256": upload.sha256,
-        "size_bytes": upload.size_bytes,
-        "media_type": upload.media_type,
-        "format": told.recording.format,
-        "integrity": "full" if upload.vouched else told.recording.integrity,
-        "timed": timed,
-        "columns": [as_json(column) for column in told.recording.columns],
-        **about,
-    }
-
-
-def _untimed(about: dict[str, Any]) -> dict[str, Any]:
-    nothing = {"duration_s": None, "rate_hz": None, "longest_gap_s": None}
-    return about | {
-        "duration_s": None,
-        "quality": [one | nothing for one in about["quality"]],
-        "segments": [],
-        "counts": about["counts"] | {"segments": 0},
-    }
-
-
-def entry_of(upload: Upload, told: ParsedContent) -> Entry | None:
-    """Serialise what was read of an upload for `keep`, before its transaction; None if it is too large to be kept."""
-    return packed_content(upload.sha256, upload.size_bytes, upload.reading, told)
+    parsed = parse_upload(upload, partial(parse, untimed=True))
+    content = vars(parsed.about)
+    timed = parsed.recording.is_timed or upload.reading.rate_hz is not None
+    if not timed:
+        quality = [
+            described.PreviewedQuality(one.arm, one.topic, None, None, None, one.extent_mm, one.equal_samples)
+            for one in parsed.about.quality
+        ]
+        counts = replace(parsed.about.counts, segments=0)
+        content = content | {"duration_s": None, "quality": quality, "segments": [], "counts": counts}
+    return described.RecordingPreview(
+        sha256=upload.sha256,
+        size_bytes=upload.size_bytes,
+        media_type=upload.media_type,
+        format=parsed.recording.format,
+        integrity="full" if upload.vouched else parsed.recording.integrity,
+        timed=timed,
+        columns=list(parsed.recording.columns),
+        **content,
+    )
 
 
 def send_ahead(database: Database, upload: Upload) -> int | None:
     """Store the chunks of a large upload before its row, in several short transactions, for which others can wait.
 
-    They belong to nobody until `keep` stores the row; if it does not, they are deleted when they are due
+    They belong to nobody until `put_recording` stores the row; if it does not, they are deleted when they are due
     (`skills.library.operation.sweep`).
 
     Returns:
-        The number of the row to be stored; None if `keep` stores the chunks with the row, because they are few or the
-        bytes are stored already.
+        The number of the row to be stored; None if `put_recording` stores the chunks with the row, because they are few
+        or the bytes are stored already.
 
     Raises:
         Busy: It took longer than `DUE_S`.
@@ -279,8 +267,8 @@ def _add_chunks(session: Session, row: int, number: int, data: bytes) -> int:
     return number
 
 
-def keep(
-    session: Session, upload: Upload, told: ParsedContent, entry: Entry | None, actor: str, ahead: int | None = None
+def put_recording(
+    session: Session, upload: Upload, parsed: ParsedContent, entry: Entry | None, actor: str, ahead: int | None = None
 ) -> tuple[StoredRecording, bool]:
     """Write a recording in the caller's transaction, once; return the row, and whether it is new to the actor.
 
@@ -289,8 +277,8 @@ def keep(
     Args:
         session: The caller's transaction.
         upload: The recording's bytes.
-        told: What was read of them.
-        entry: The same, from `entry_of`; a large one is left to `cache_large`.
+        parsed: Their content.
+        entry: The same, from `entry_of`; a large one is left to `cache_content`.
         actor: The owner of the caller's key.
         ahead: The number of its row, from `send_ahead`.
 
@@ -299,7 +287,7 @@ def keep(
     """
     same = select(StoredRecording).where(StoredRecording.sha256 == upload.sha256)
     stored = session.scalar(same.execution_options(**ALL_ROWS))
-    entry = None if entry is not None and len(entry.data) > AT_ONCE_BYTES else entry
+    entry = None if entry is not None and entry.is_large else entry
     if stored is not None:
         if ahead is not None:  # another upload of the same bytes was faster
             session.execute(update(LooseChunks).where(LooseChunks.recording_row == ahead).values(due_at=now()))
@@ -308,14 +296,15 @@ def keep(
                 raise Conflict(
                     "These bytes cannot be stored with these reading parameters; ask the operator of the service."
                 )
-            before = " and ".join(f"no {name}" if to is None else f"{name} {to}" for name, to in stored.reading.items())
+            options = {"rate_hz": None, "frame": None} | stored.reading.options
+            before = " and ".join(f"no {name}" if to is None else f"{name} {to}" for name, to in options.items())
             raise Conflict(
                 f"These bytes are stored already, read with {before}; send the same parameters.",
                 Remedy(Action.DELETE_FIRST, recording=stored.sha256),
             )
         if entry is not None and not is_cached(session, stored):
             put_entry(session, stored.row, entry)
-        return stored, _brought_by(session, stored, actor)
+        return stored, _note_upload(session, stored, actor)
     if ahead is not None:
         _still_loose(session, ahead)
         session.execute(delete(LooseChunks).where(LooseChunks.recording_row == ahead))
@@ -324,10 +313,10 @@ def keep(
         sha256=upload.sha256,
         size_bytes=upload.size_bytes,
         media_type=upload.media_type,
-        format=told.recording.format,
-        integrity="full" if upload.vouched else told.recording.integrity,
+        format=parsed.recording.format,
+        integrity="full" if upload.vouched else parsed.recording.integrity,
         reading=upload.reading,
-        about=told.about,
+        about=parsed.about,
     )
     session.add(stored)
     session.flush()
@@ -339,10 +328,10 @@ def keep(
             number = _add_chunks(session, stored.row, number, data)
     if entry is not None:
         put_entry(session, stored.row, entry)
-    return stored, _brought_by(session, stored, actor)
+    return stored, _note_upload(session, stored, actor)
 
 
-def _brought_by(session: Session, stored: StoredRecording, actor: str) -> bool:
+def _note_upload(session: Session, stored: StoredRecording, actor: str) -> bool:
     """Record that an actor uploaded a recording; return whether this is the actor's first upload of it."""
     if session.get(RecordingUpload, (stored.row, actor)) is not None:
         return False
@@ -358,16 +347,16 @@ def find_recording(session: Session, recording_sha256: str) -> StoredRecording:
 
 
 def stored_recording(
-    database: Database, recording_sha256: str, tell: Teller = parse_recording, *, intact: bool = False
+    database: Database, recording_sha256: str, parse: Parser = parse_recording, *, intact: bool = False
 ) -> ParsedContent:
-    """Return what is read of a stored recording: from the cache, or else decoded again, and cached.
+    """Return the content of a stored recording: from the cache, or else decoded again, and cached.
 
     No transaction is open while it is decoded.
 
     Args:
         database: The database, restricted to the rows that the caller may see.
         recording_sha256: The SHA-256 of its bytes.
-        tell: The reader, possibly in another process.
+        parse: The reader, possibly in another process.
         intact: Verify the digest of the bytes also where they are not decoded, for a row that will rest on them.
 
     Raises:
@@ -378,72 +367,17 @@ def stored_recording(
     with tempfile.TemporaryFile() as file:
         with database.reading() as session:
             stored = find_recording(session, recording_sha256)
-            kept = cached_content(session, stored)
-            if kept is not None:
+            cached = cached_content(session, stored)
+            if cached is not None:
                 if intact:
                     deque(recording_bytes(session, stored), maxlen=0)
-                return kept
+                return cached
             file.writelines(recording_bytes(session, stored))
-        told = tell(file, **stored.reading)
-    _remember(database, stored, told)
-    return told
-
-
-def _remember(database: Database, stored: StoredRecording, told: ParsedContent) -> None:
-    """Cache what was read of a stored recording, unless the recording was erased meanwhile."""
-    entry = packed_content(stored.sha256, stored.size_bytes, stored.reading, told)
-    if entry is None:
-        return
-    if len(entry.data) > AT_ONCE_BYTES:
-        cache_large(database, stored, entry)
-        return
-    try:
-        with database.writing([locks.recording(stored.sha256)]) as session:
-            if session.get(StoredRecording, stored.row) is not None:
-                put_entry(session, stored.row, entry)
-    except Busy as error:  # the caller has the recording; the next use decodes it again
-        log.info("recordings %d: it was read, but could not be cached (%s).", stored.row, type(error).__name__)
-
-
-def cache_large(database: Database, stored: StoredRecording, entry: Entry | None) -> None:
-    """Cache a large content of a stored recording in several short transactions; its row gets its version in the last.
-
-    Nothing is done for a small content, which `keep` stores, or if the recording is erased meanwhile. Two callers may
-    write the same content at once: each adds the chunks that are missing.
-    """
-    if entry is None or len(entry.data) <= AT_ONCE_BYTES:
-        return
-    names = [locks.recording(stored.sha256)]
-    mine = (ParsedRecording.recording_row == stored.row, ParsedRecording.sha256 == entry.sha256)
-    try:
-        with database.writing(names) as session:
-            if session.get(StoredRecording, stored.row) is None or is_cached(session, stored):
-                return
-            if session.scalar(select(ParsedRecording.recording_row).where(*mine)) is None:
-                session.execute(delete(ParsedRecording).where(ParsedRecording.recording_row == stored.row))
-                unfinished = {"version": UNFINISHED, "reading": entry.reading, "sha256": entry.sha256}
-                session.add(ParsedRecording(recording_row=stored.row, **unfinished))
-        for start in range(0, len(entry.data), AT_ONCE_BYTES):
-            with database.writing(names) as session:
-                if session.scalar(select(ParsedRecording.recording_row).where(*mine)) is None:
-                    return
-                _add_missing(session, stored.row, entry, start)
-        with database.writing(names) as session:
-            session.execute(update(ParsedRecording).where(*mine).values(version=READER_VERSION))
-    except Busy as error:
-        log.info("recordings %d: it was read, but could not be cached (%s).", stored.row, type(error).__name__)
-
-
-def _add_missing(session: Session, recording_row: int, entry: Entry, start: int) -> None:
-    """Add the chunks of an entry from one byte on, `AT_ONCE_BYTES` of them, that are not stored yet."""
-    first, of = start // CHUNK_BYTES, ParsedChunk
-    known = select(of.number).where(of.recording_row == recording_row, of.number >= first)
-    there = set(session.scalars(known))
-    for number in range(first, first + AT_ONCE_BYTES // CHUNK_BYTES):
-        piece = bytes(entry.data[number * CHUNK_BYTES : (number + 1) * CHUNK_BYTES])
-        if piece and number not in there:
-            session.add(ParsedChunk(recording_row=recording_row, number=number, data=piece))
-            session.flush()
+        parsed = parse(file, **stored.reading.options)
+    entry = entry_of(stored, parsed)
+    if entry is not None:
+        cache_content(database, stored, entry)
+    return parsed
 
 
 def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes]:
@@ -492,131 +426,27 @@ def damaged() -> Corrupt:
     return Corrupt("A stored file does not match its digest; restore it from a backup.")
 
 
-def recording_json(row: StoredRecording) -> dict[str, Any]:
-    """Return a recording's JSON."""
-    return {
-        "id": row.sha256,
-        "sha256": row.sha256,
-        "size_bytes": row.size_bytes,
-        "media_type": row.media_type,
-        "format": row.format,
-        "integrity": row.integrity,
-        **row.about,
-        "created_at": rfc3339(row.created_at),
-    }
+def describe_recording(row: StoredRecording) -> described.Recording:
+    """Return a recording as it is sent to clients."""
+    identity = {name: getattr(row, name) for name in described.Described.model_fields}
+    return described.Recording(id=row.sha256, created_at=row.created_at, **identity, **vars(row.about))
 
 
-def summary_json(row: StoredRecording, demos: int) -> dict[str, Any]:
-    """Return a recording's JSON in a list.
+def summarise_recording(row: StoredRecording, demos: int) -> described.RecordingSummary:
+    """Return a recording as it is sent in a list.
 
     Args:
         row: The recording.
         demos: Number of its active demonstrations.
     """
-    return {
-        "id": row.sha256,
-        "sha256": row.sha256,
-        "size_bytes": row.size_bytes,
-        "format": row.format,
-        "duration_s": row.about["duration_s"],
-        "arms": sorted({motion["arm"] for motion in row.about["motions"]}),
-        "segments": len(row.about["segments"]),
-        "demos": demos,
-        "created_at": rfc3339(row.created_at),
-    }
-
-
-def packed_content(
-    recording_sha256: str, size_bytes: int, reading: dict[str, Any], told: ParsedContent
-) -> Entry | None:
-    """Serialise the content of a recording; None if it takes more bytes than are kept of one.
-
-    It is called before the transaction, for which others wait.
-
-    Args:
-        recording_sha256: The SHA-256 of the recording's bytes.
-        size_bytes: Their number.
-        reading: The reading parameters.
-        told: What was read.
-    """
-    out = io.BytesIO()
-    packing.write(out, told, KNOWN)
-    data = out.getbuffer()
-    if len(data) > max(LEAST_BYTES, MOST_SHARE * size_bytes):
-        return None
-    parameters = _digest_of(reading)
-    return Entry(parameters, _seal(recording_sha256, parameters, data), data)
-
-
-def put_entry(session: Session, recording_row: int, entry: Entry) -> None:
-    """Store the entry of a recording, in place of any other."""
-    session.execute(delete(ParsedRecording).where(ParsedRecording.recording_row == recording_row))
-    kept = {"version": READER_VERSION, "reading": entry.reading, "sha256": entry.sha256}
-    session.add(ParsedRecording(recording_row=recording_row, **kept))
-    session.flush()
-    for number, start in enumerate(range(0, len(entry.data), CHUNK_BYTES)):
-        piece = bytes(entry.data[start : start + CHUNK_BYTES])
-        session.add(ParsedChunk(recording_row=recording_row, number=number, data=piece))
-        session.flush()
-
-
-def is_cached(session: Session, stored: StoredRecording) -> bool:
-    """Return whether a recording has an entry of this version and of its reading parameters."""
-    row = session.get(ParsedRecording, stored.row, execution_options=ALL_ROWS)
-    return row is not None and (row.version, row.reading) == (READER_VERSION, _digest_of(stored.reading))
-
-
-def cached_content(session: Session, stored: StoredRecording) -> ParsedContent | None:
-    """Return the content of a recording from its entry; None if there is none that may be used."""
-    if not is_cached(session, stored):
-        return None
-    try:
-        return read_entry(session, stored)
-    except Corrupt as error:
-        log.warning("parsed_recordings %d: %s", stored.row, error.message)
-        return None
-
-
-def read_entry(session: Session, stored: StoredRecording) -> ParsedContent:
-    """Return the content of a recording from its entry, of this version.
-
-    Raises:
-        Corrupt: The entry does not match its digest, or is not one that this version wrote.
-    """
-    row = session.get_one(ParsedRecording, stored.row)
-    query = select(ParsedChunk.data).where(ParsedChunk.recording_row == stored.row).order_by(ParsedChunk.number)
-    data = b"".join(session.scalars(query.execution_options(yield_per=1)))
-    if _seal(stored.sha256, row.reading, data) != row.sha256:
-        raise Corrupt("The entry does not match its digest and is not used; the recording's bytes are decoded instead.")
-    try:
-        told = packing.read(io.BytesIO(data), KNOWN)
-        if not isinstance(told, ParsedContent):
-            raise TypeError(type(told).__name__)
-    except Exception as error:  # of any class: its values are refused, or their form is unknown
-        raise Corrupt("The entry cannot be read and is not used; the recording's bytes are decoded instead.") from error
-    return told
-
-
-def alike(one: Any, other: Any) -> bool:
-    """Return whether two values are equal, their floating-point numbers within `TOLERANCE`."""
-    if type(one) is not type(other):
-        return False
-    if is_dataclass(one):
-        return all(alike(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
-    if isinstance(one, tuple):
-        return len(one) == len(other) and all(map(alike, one, other))
-    if isinstance(one, np.ndarray):
-        same_kind = (one.shape, one.dtype) == (other.shape, other.dtype)
-        return same_kind and bool((np.abs(one - other) <= TOLERANCE).all())
-    return bool(abs(one - other) <= TOLERANCE) if isinstance(one, float) else bool(one == other)
-
-
-def _digest_of(reading: dict[str, Any]) -> str:
-    return packing.sha256(canonical(reading))
-
-
-def _seal(recording_sha256: str, parameters: str, data: bytes | memoryview) -> str:
-    """Return the digest of an entry with the recording to which it belongs: moved to another one, it does not match."""
-    seen = hashlib.sha256(canonical([recording_sha256, parameters, READER_VERSION]))
-    seen.update(data)
-    return seen.hexdigest()
+    return described.RecordingSummary(
+        id=row.sha256,
+        sha256=row.sha256,
+        size_bytes=row.size_bytes,
+        format=row.format,
+        duration_s=row.about.duration_s,
+        arms=sorted({motion.arm for motion in row.about.motions}),
+        segments=len(row.about.segments),
+        demos=demos,
+        created_at=row.created_at,
+    )

@@ -25,7 +25,7 @@ from skills.library.plans.plans import find_plan, motion_of, trajectory_of
 from skills.library.policies import versions
 from skills.library.policies.versions import poses_of
 from skills.library.recordings.demos import demo_for, find_demo
-from skills.library.recordings.recordings import Teller, find_recording, stored_recording
+from skills.library.recordings.recordings import Parser, find_recording, stored_recording
 from skills.verification.timeline import (
     Timeline,
     timeline_of_demo,
@@ -38,7 +38,7 @@ Source = Literal["recordings", "demos", "policy-versions", "plans"]
 MOST_CHOICES = 50
 
 
-def timeline_of(database: Database, source: Source, sha256: str, tell: Teller) -> Timeline:
+def timeline_of(database: Database, source: Source, sha256: str, parse: Parser) -> Timeline:
     """Return the timeline of a resource; no transaction is open while it is computed.
 
     Raises:
@@ -48,14 +48,14 @@ def timeline_of(database: Database, source: Source, sha256: str, tell: Teller) -
         Corrupt: What is stored does not match its digest.
     """
     if source == "recordings":
-        return timeline_of_recording(shown_recording(database, sha256, tell).recording)
+        return timeline_of_recording(shown_recording(database, sha256, parse).recording)
     if source == "demos":
         with database.reading() as session:
             recording = find_demo(session, sha256).recording.sha256
-        told = stored_recording(database, recording, tell)
+        parsed = stored_recording(database, recording, parse)
         with database.reading() as session:
             demo = demo_for(session, sha256, "any").demo
-        return timeline_of_demo(told.recording, demo)
+        return timeline_of_demo(parsed.recording, demo)
     if source == "policy-versions":
         with database.reading() as session:
             poses = poses_of(versions.followable(versions.find_by_digest(session, sha256)))

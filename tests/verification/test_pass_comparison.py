@@ -1,15 +1,22 @@
-"""Faults within a pass: its path and rotation in A1, A2, and PSM_M as it comes for the needle."""
+"""One pass of a motion: every fault that is planted is named by its kind and its first sample."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from skills.kinematics import quaternion_of
+from skills.kinematics import instrument_of, quaternion_of
+from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, PsmM
+from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER
 from skills.verification.clearance import stands_from
+from skills.verification.deviations import LIMITS
 from skills.verification.intent import compare
-from skills.verification.requested import RequestedMotion
+from skills.verification.requested import RequestedMotion, requested_motion
 from tests.planning.motions import PSM_M
+from tests.planning.test_hand import turning
 from tests.verification.faults import (
+    RATE_HZ,
     Fault,
     Faults,
     Motion,
@@ -20,14 +27,16 @@ from tests.verification.faults import (
     bump,
     check_named,
     jaw_off,
+    planned,
     poses,
     rising,
     shift,
     sound,
     stall,
+    timed,
     turn,
 )
-from tests.verification.hands import about
+from tests.verification.hands import BASE_MM, BASE_XYZW, about
 
 PATH = "path off the recording"
 
@@ -181,7 +190,7 @@ def m_too_near(motion: Motion) -> int:
     return 0
 
 
-FAULTS: Faults = {
+PASS_FAULTS: Faults = {
     "goal 10 mm off": (goal_off, PATH, 150),
     "goal 1 mm off": (goal_a_little_off, "end of A1 off the suture point", 0),
     "start 10 mm off": (start_off, "start of the pass off the asked one", 0),
@@ -212,11 +221,6 @@ FAULTS: Faults = {
     "PSM_M waits too near": (m_too_near, "PSM_M off where it waits", 0),
     "a pass left out": (pass_left_out, "number of passes off the suture points", 0),
 }
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_of_a_pass_is_named_by_its_kind_and_its_first_sample(name):
-    check_named(*FAULTS[name])
 
 
 def test_the_recorded_hand_off_missed_by_a_third_of_a_degree_is_named():
@@ -288,3 +292,217 @@ def test_a_held_jaw_that_turns_by_a_degree_is_named():
     kind, sample = broken(compare(asked, changed.built()))
     assert kind == "jaw off its stated rotation"
     assert rows[0] <= sample <= rows[40]
+
+
+A_LETS_GO = "PSM_A's jaw opens before PSM_M's holds"
+
+
+def opens(phase: int) -> Fault:
+    """Return a fault: the jaw opens in the middle of a phase, and drops the needle."""
+
+    def plant(motion: Motion) -> int:
+        rows = motion.rows(phase)
+        rows = rows[len(rows) // 2 :]
+        motion.jaw[rows] += 0.3
+        return rows[0]
+
+    return plant
+
+
+def changes(motion: Motion, phase: int = A2) -> np.ndarray:
+    """Return the samples at the end of a phase in which the jaws move."""
+    return np.flatnonzero((motion.passes == 1) & (motion.phase == phase) & motion.still)
+
+
+def lets_go_early(motion: Motion) -> int:
+    rows = changes(motion)
+    opened = motion.jaw[rows]
+    motion.jaw[rows] = np.append(opened[40:], np.full(40, opened[-1]))
+    return rows[40]
+
+
+def m_never_closes(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.m_jaw[rows] = JAW_OPEN_RAD
+    return rows[len(rows) // 2]
+
+
+def m_closes_halfway(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.m_jaw[rows] = (motion.m_jaw[rows] + JAW_OPEN_RAD) / 2
+    return rows[len(rows) // 2]
+
+
+def stuck(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.jaw[rows] = motion.jaw[rows[0] - 1]
+    return rows[-1]
+
+
+def both_stuck(motion: Motion) -> int:
+    m_never_closes(motion)
+    return stuck(motion)
+
+
+def jaws_swapped(motion: Motion) -> int:
+    motion.jaw, motion.m_jaw = motion.m_jaw, motion.jaw
+    return 0
+
+
+def m_comes_closed(motion: Motion) -> int:
+    rows = motion.rows(A2)[50:]
+    motion.m_jaw[rows] = JAW_CLOSED_RAD
+    motion.m_jaw[rows[:40]] = np.linspace(JAW_OPEN_RAD, JAW_CLOSED_RAD, 40)
+    return rows[1]
+
+
+def m_snaps(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.m_jaw[rows[1:]] = JAW_CLOSED_RAD
+    return rows[0]
+
+
+def m_too_far(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.m_jaw[rows] = np.where(motion.m_jaw[rows] < 0, motion.m_jaw[rows] * 3, motion.m_jaw[rows])
+    return rows[np.flatnonzero(motion.m_jaw[rows] < instrument_of("400006").jaw_rad[0])[0]]
+
+
+def m_drops(motion: Motion) -> int:
+    rows = motion.rows(TRANSFER)[30:60]
+    motion.m_jaw[rows] += 0.3
+    return rows[0]
+
+
+def not_taken_back(motion: Motion) -> int:
+    rows = changes(motion, TRANSFER)
+    motion.jaw[rows] = motion.jaw[rows[0] - 1]
+    return rows[len(rows) // 2]
+
+
+def closes_on_the_way(motion: Motion) -> int:
+    rows = motion.rows(TRANSFER)[30:60]
+    motion.jaw[rows] -= 0.3
+    return rows[0]
+
+
+JAW_FAULTS: Faults = {
+    "jaw opens in A1": (opens(A1), "opening of the jaw off the recording", 0),
+    "jaw opens in A2": (opens(A2), A_LETS_GO, 0),
+    "jaw opens 0.4 s too early": (lets_go_early, A_LETS_GO, 5),
+    "PSM_M's jaw never closes": (m_never_closes, A_LETS_GO, 5),
+    "PSM_M's jaw closes halfway": (m_closes_halfway, A_LETS_GO, 5),
+    "both jaws stuck": (both_stuck, "needle has not changed hands", 0),
+    "PSM_A's jaw stuck": (stuck, "needle has not changed hands", 0),
+    "jaws swapped": (jaws_swapped, "opening of the jaw off the recording", 0),
+    "PSM_M comes in closed": (m_comes_closed, "PSM_M's jaw not open as it comes in", 0),
+    "PSM_M's jaw closes in one tick": (m_snaps, "speed of a jaw", 0),
+    "PSM_M's jaw closes too far": (m_too_far, "a jaw beyond its limits", 0),
+    "PSM_M drops the needle in the transfer": (m_drops, "PSM_M's jaw opens before PSM_A's holds", 0),
+    "PSM_A does not take it again": (not_taken_back, "PSM_M's jaw opens before PSM_A's holds", 5),
+    "PSM_A's jaw closes on the way": (closes_on_the_way, "a jaw moves with an arm", 0),
+}
+
+
+def test_a_jaw_that_was_not_recorded_stays_closed_in_a1():
+    demo, policy = turning()
+    bare, psm_m = replace(demo, jaw_rad=None), PsmM(PSM_M, BASE_MM, BASE_XYZW)
+    point = SuturePoint(tuple(demo.tip_mm[-1].tolist()))
+    plan = stack(policy, [point], demo=bare, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
+    asked, motion = requested_motion(plan, policy, bare), poses(timed(plan.passes, psm_m))
+    assert broken(compare(asked, motion.built())) is None
+    rows = motion.rows(A1, 0)[300:]
+    motion.jaw[rows] += 0.01
+    assert broken(compare(asked, motion.built())) == (A_LETS_GO, rows[0])
+
+
+def test_an_arm_that_slips_at_the_last_moment_was_not_standing_still():
+    asked, motion = sound()
+    changed = poses(motion)
+    closing = changes(changed)
+    changed.still[closing[-1]] = False
+    changed.m_tip[closing[-1]] += 0.01 * Z
+    assert broken(compare(asked, changed.built())) == ("PSM_M's jaw not open as it comes in", closing[0])
+
+
+def test_a_jaw_without_psm_m_stays_between_its_angles_around_a_transfer():
+    asked, psm_m = replace(sound()[0], psm_m=PsmM(PSM_M)), PsmM(PSM_M)
+    motion = timed(planned().passes, psm_m)
+    assert broken(compare(asked, motion)) is None
+    opened, rows = np.array(motion.jaw_rad), np.flatnonzero((motion.pass_index == 1) & (motion.phase == TRANSFER))
+    opened[rows] = min(opened[rows[0] - 1], opened[rows[-1] + 1]) - 0.1
+    assert broken(compare(asked, replace(motion, jaw_rad=opened))) == ("opening of the jaw off the recording", rows[0])
+
+
+def own_start_ignored(motion: Motion) -> int:
+    """A transfer leads 3 mm beside the start that was given."""
+    transfer, rows = motion.rows(TRANSFER, 2), motion.rows(A1, 2)
+    motion.tip[transfer[-100:]] += rising(100)[:, None] * 3 * Y
+    motion.tip[rows[:200]] += (1 - rising(200))[:, None] * 3 * Y
+    return transfer[-100]
+
+
+def m_stays(motion: Motion) -> int:
+    """PSM_M leaves late, and PSM_A moves off while PSM_M still holds the needle."""
+    rows = motion.rows(TRANSFER)
+    moves = rows[np.linalg.norm(motion.tip[rows] - motion.tip[rows[0]], axis=1) > 0.05][0]
+    late = np.linspace(0.0, 1.0, len(rows)) ** 1.5 * (len(rows) - 1)
+    number = np.arange(len(rows))
+    motion.m_tip[rows] = np.stack([np.interp(late, number, axis) for axis in motion.m_tip[rows].T], axis=1)
+    return moves
+
+
+def transfer_bulges(motion: Motion) -> int:
+    rows = motion.rows(TRANSFER)
+    rows = rows[len(rows) // 2 :]
+    shift(motion, rows, bump(len(rows))[:, None] * 5 * X)
+    return rows[0]
+
+
+def transfer_goes_back(motion: Motion) -> int:
+    rows = motion.rows(TRANSFER)
+    far = np.linalg.norm(motion.tip[rows] - motion.tip[rows[0]], axis=1)
+    at = rows[int(np.argmax(far > 0.5 * far[-1]))]
+    motion.repeat(np.concatenate((np.arange(at), np.arange(at, at - 20, -1), np.arange(at - 20, len(motion.tip)))))
+    return at
+
+
+TRANSFER_FAULTS: Faults = {
+    "a start of its own is ignored": (own_start_ignored, "PSM_A off the straight transfer", 50),
+    "PSM_A leaves before PSM_M": (m_stays, "PSM_A leaves before PSM_M", 1),
+    "transfer bulges": (transfer_bulges, "PSM_A off the straight transfer", 20),
+    "transfer goes back": (transfer_goes_back, "PSM_A off the straight transfer", 100),
+    "transfer's jaw takes a detour": (jaw_off(20.0, TRANSFER, X), "transfer leaves the shorter way", 50),
+    "transfer's jaw takes a small detour": (jaw_off(0.3, TRANSFER, X), "transfer leaves the shorter way", 100),
+    "transfer stalls": (stall(TRANSFER, 1, 0.5), "standing still", 50),
+}
+
+
+def test_in_the_first_transfer_the_jaw_may_turn_evenly():
+    """A pass whose start is outside of the grid begins with a transfer; its jaw turns to where A1 has it."""
+    demo, policy = turning()
+    point, psm_m = SuturePoint(tuple(demo.tip_mm[-1].tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
+    start = np.array(policy.path.grid.origin_mm) - 10.0
+    plan = stack(policy, [point], demo=demo, psm_m=psm_m, starts_mm=[start], rate_hz=RATE_HZ, speed_mm_s=20.0)
+    asked, motion = requested_motion(plan, policy, demo), poses(timed(plan.passes, psm_m))
+    rows = motion.rows(TRANSFER, 0)
+    turn(motion.turned, rows, X, np.linspace(10.0, 0.0, len(rows) + 1)[:-1])
+    assert 10.0 / len(rows) > LIMITS["transfer leaves the shorter way"][1] / 2
+    assert broken(compare(asked, motion.built())) is None
+
+
+def test_a_jaw_that_turns_while_the_tip_stands_is_not_standing_still():
+    asked, motion = sound()
+    changed = poses(motion)
+    at = stall(TRANSFER, 1, 0.5)(changed)
+    turn(changed.turned, np.arange(at, at + 50), X, np.linspace(0.0, 5.0, 50))
+    stood = compare(asked, changed.built()).values["standing still"]
+    assert stood[at : at + 50].max() < 1
+
+
+FAULTS = PASS_FAULTS | JAW_FAULTS | TRANSFER_FAULTS
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_named_by_its_kind_and_its_first_sample(name):
+    check_named(*FAULTS[name])

@@ -8,6 +8,8 @@ import pytest
 
 from skills.demonstration.recording import Joints, Label, Recording, Signal
 from skills.formats.parsed import MOST, parse
+from skills.schemas import recordings as described
+from skills.schemas.recordings import Following, JointStates, Pedal, Scale
 from tests.demonstration import sessions
 from tests.demonstration.sessions import Kind, session
 
@@ -34,41 +36,41 @@ def recorded() -> Recording:
 
 def test_all_that_a_recording_has_is_told(recorded):
     about = parse(recorded).about
-    assert about["joints"] == [{"arm": "PSM2", "topic": "/PSM2/measured_js", "joints": 6}]
-    assert about["pedals"] == [{"topic": "/footpedals/coag", "presses": 1, "pressed_s": 3.0}]
-    assert about["following"] == [{"teleoperation": "MTMR_PSM2", "following_s": pytest.approx(recorded.duration_s)}]
-    assert about["scales"] == [{"teleoperation": "MTMR_PSM2", "least": 0.2, "greatest": 0.3}]
-    assert about["tools"] == {"PSM2": "LARGE_NEEDLE_DRIVER:400006"}
-    assert about["labels"] == [{"name": "insertion", "kind": "stage", "start_s": 1.0, "end_s": 3.0}]
-    assert {one["arm"] for one in about["quality"]} == {"PSM1", "PSM2"}
-    assert [one["found_by"] for one in about["segments"] if one["arm"] == "PSM2"] == ["transfer", "transfer"]
+    assert about.joints == [JointStates("PSM2", "/PSM2/measured_js", 6)]
+    assert about.pedals == [Pedal("/footpedals/coag", 1, 3.0)]
+    assert about.following == [Following("MTMR_PSM2", pytest.approx(recorded.duration_s))]
+    assert about.scales == [Scale("MTMR_PSM2", 0.2, 0.3)]
+    assert about.tools == {"PSM2": "LARGE_NEEDLE_DRIVER:400006"}
+    assert about.labels == [described.Label("insertion", "stage", 1.0, 3.0)]
+    assert {one.arm for one in about.quality} == {"PSM1", "PSM2"}
+    assert [one.found_by for one in about.segments if one.arm == "PSM2"] == ["transfer", "transfer"]
 
 
 def test_where_an_arms_base_stands_in_the_camera_is_told(recorded):
     about = parse(recorded).about
-    assert {(one["arm"], one["frame"]) for one in about["base_frames"]} == {("PSM1", "ECM"), ("PSM2", "ECM")}
+    assert {(one.arm, one.frame) for one in about.base_frames} == {("PSM1", "ECM"), ("PSM2", "ECM")}
 
 
 def test_it_is_plain_json(recorded):
-    about = parse(recorded).about
-    assert json.loads(json.dumps(about, allow_nan=False)) == json.loads(json.dumps(about))
+    about = parse(recorded).about.model_dump(mode="json")
+    assert json.loads(json.dumps(about, allow_nan=False)) == about
 
 
 def test_a_recording_with_little_in_it_has_little_told():
     value, _ = session(Kind(seed=6, passes=1, jaw=False, clutch=False, both_arms=False, wrist=False))
     about = parse(value).about
     for name in ("joints", "masters", "pedals", "following", "scales", "labels"):
-        assert about[name] == []
+        assert getattr(about, name) == []
     empty = Signal(np.empty(0, np.int64), np.empty(0))
     silent = parse(replace(value, following=(("MTMR_PSM2", empty),), scales=(("MTMR_PSM2", empty),))).about
-    assert silent["following"] == [{"teleoperation": "MTMR_PSM2", "following_s": 0.0}]
-    assert silent["scales"] == []
+    assert silent.following == [Following("MTMR_PSM2", 0.0)]
+    assert silent.scales == []
 
 
 def test_what_a_recording_may_make_as_long_as_it_likes_is_cut_and_counted(recorded):
     origin_ns = recorded.origin_ns
     marks = tuple(Label("knot", "stage", origin_ns + k, origin_ns + k + 1) for k in range(3 * MOST))
     about = parse(replace(recorded, labels=marks)).about
-    assert (len(about["labels"]), about["counts"]["labels"]) == (MOST, 3 * MOST)
-    assert about["counts"]["segments"] == len(about["segments"])
-    assert sessions.A in {one["arm"] for one in about["segments"]}
+    assert (len(about.labels), about.counts.labels) == (MOST, 3 * MOST)
+    assert about.counts.segments == len(about.segments)
+    assert sessions.A in {one.arm for one in about.segments}

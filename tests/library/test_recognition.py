@@ -1,14 +1,13 @@
 """Recognition of whole recordings on a real database: with consent, of one surgeon, and without its own session."""
 
 import pytest
-from skills.library.whose import recognise_recording
 from sqlalchemy import select
 
 from skills.db.models import Demonstration
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.parsed import parse_recording
-from skills.library.people.catalogue import put_surgeon
+from skills.library.comparison.recognition import recognise_recording
 from skills.schemas.comparison import RecognisedRecording
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
@@ -30,10 +29,10 @@ def test_only_recordings_of_one_surgeon_who_agreed_are_compared(database: Databa
         recognised(database, second)
     assert recognised(database, first).votes.recordings == 4  # the other one of its surgeon has no other session
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(2), {"consent": {"uses": [], "until": None}}, "test")
+        cases.agree(session, {"uses": [], "until": None}, cohorts.name(2))
     with pytest.raises(BadInput, match="two surgeons with two sessions"):
         recognised(database, first)
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(0), {"consent": {"uses": [], "until": None}}, "test")
+        cases.agree(session, {"uses": [], "until": None}, cohorts.name(0))
     with pytest.raises(NotFound, match="no demonstration"):
         recognised(database, first)
