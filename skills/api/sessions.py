@@ -26,7 +26,7 @@ from typing import Any
 import orjson
 from anyio import to_thread
 from pydantic import ValidationError
-from sqlalchemy import select
+from sqlalchemy import String, bindparam, func, select, type_coerce
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import aliased
 from starlette.types import Scope
@@ -37,13 +37,14 @@ from skills.api.places import Places
 from skills.api.rate_limits import Bucket
 from skills.api.responses import json_of
 from skills.api.strict_json import strictly_read
-from skills.db.changes import Changes
+from skills.db.changes import Changes, Unasked
 from skills.db.models import PolicyVersion, Release, Surgeon
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError, TooMany
 from skills.fields import as_json
 from skills.learning.tube import CertifiedPoses, next_pose
 from skills.library.people import consent
+from skills.library.policies import releases
 from skills.library.policies.versions import next_json, policy_of, poses_of
 from skills.schemas.pose_styles import PoseIn
 from skills.settings import Settings
@@ -65,21 +66,22 @@ UNWATCHED = "The service cannot see a withdrawal; open the session again."
 UNREADABLE = "The database cannot be read, so a withdrawal would not be seen; open the session again."
 
 
-# What `_judged` needs of a release; `newest` is the version of its style's newest release that is not withdrawn.
-_NEWER, _NEWER_POLICY = aliased(Release), aliased(PolicyVersion)
-_NEWEST = (
-    select(_NEWER_POLICY.version)
-    .join(_NEWER, _NEWER.policy_row == _NEWER_POLICY.row)
-    .where(_NEWER.surgeon_row == Release.surgeon_row, _NEWER.suture == Release.suture, _NEWER.withdrawn_at.is_(None))
-    .order_by(_NEWER.row.desc())
-    .limit(1)
-    .scalar_subquery()
-)
+# The columns by which `_look` judges a release, and the newest release of its style that stands.
+_NEWER = aliased(Release)
 JUDGED = (
-    select(Release.row, Release.released_at, Release.withdrawn_at, PolicyVersion.sha256, Surgeon.slug, Surgeon.consent)
-    .add_columns(_NEWEST.label("newest"))
+    select(
+        type_coerce(Release.released_at, String).label("released_at"),
+        type_coerce(Release.withdrawn_at, String).label("withdrawn_at"),
+        PolicyVersion.sha256,
+        consent.AS_TEXT.label("consent"),
+        select(func.max(_NEWER.row))
+        .where(_NEWER.surgeon_row == Release.surgeon_row, _NEWER.suture == Release.suture)
+        .where(_NEWER.withdrawn_at.is_(None))
+        .scalar_subquery(),
+    )
     .join(Surgeon, Surgeon.row == Release.surgeon_row)
     .join(PolicyVersion, PolicyVersion.row == Release.policy_row)
+    .where(Release.row == bindparam("release"))
 )
 
 
@@ -161,6 +163,7 @@ class Sessions:
         self._open: set[Follower] = set()
         self._watching: list[asyncio.Task[None]] = []
         self._version: int | None = None  # of the database at the last look
+        self._rows_seen: dict[Pinned, tuple[Any, ...] | None] | None = None  # and the rows that it judged
         self._known_s = 0.0  # when the last look began that was answered
 
     async def serve(self, socket: WebSocket, surgeon: str, suture: str) -> None:
@@ -265,14 +268,15 @@ class Sessions:
             version = self._changes.version()
             looking = set(self._open)
             pinned = {one.pinned for one in looking}
-            if version is not None and version == self._version:
-                self._known_s = began_s
+            rows = None if version is None or version == self._version else await self._rows(pinned)
+            if version is not None and (version == self._version or (rows is not None and rows == self._rows_seen)):
+                self._version, self._known_s = version, began_s
             else:
                 with suppress(SkillsError, SQLAlchemyError, TimeoutError):
                     async with asyncio.timeout(UNKNOWN_S):
                         found = await to_thread.run_sync(_look, self._database, pinned, abandon_on_cancel=True)
-                    self._version, self._known_s = version, began_s
-                    _note(looking, found)
+                    self._version, self._known_s, self._rows_seen = version, began_s, rows
+                    _tell(looking, found)
             for one in looking:
                 if monotonic() - self._known_s > UNKNOWN_S or self._database.history.refused is not None:
                     one.end(BUSY, UNREADABLE)
@@ -280,6 +284,21 @@ class Sessions:
                     one.end(FORBIDDEN, "The surgeon's consent has ended.")
                 elif monotonic() - one.heard_s > self._idle_s:
                     one.end(IDLE, f"No message for {self._idle_s:g} s.")
+
+    async def _rows(self, pinned: set[Pinned]) -> dict[Pinned, tuple[Any, ...] | None] | None:
+        """Return all of which `_look` judges, read on the event loop; None where that takes longer than microseconds.
+
+        On SQLite every commit changes the version, also a worker's heartbeat, and a thread at each of them would hold
+        up the answers.
+        """
+        rows = {}
+        try:
+            for one in pinned:
+                rows[one] = self._changes.first(JUDGED, {"release": one.release})
+                await asyncio.sleep(0)  # the answers that are due meanwhile
+        except Unasked:
+            return None
+        return rows
 
     async def _watch_callers(self) -> None:
         """End the sessions of callers who may not use them any more."""
@@ -315,25 +334,25 @@ Found = tuple[tuple[int, str] | None, int | None]  # why a release must not be f
 
 
 def _look(database: Database, pinned: set[Pinned]) -> dict[Pinned, Found]:
-    """Judge all releases by one query: on SQLite it runs after every commit, also that of a worker's heartbeat."""
     with database.reading() as session:
-        query = JUDGED.where(Release.row.in_({one.release for one in pinned}))
-        rows = {row.row: row for row in session.execute(query)}
-    return {one: _judged(one, rows.get(one.release)) for one in pinned}
+        found: dict[Pinned, Found] = {}
+        for one in pinned:
+            release = session.get(Release, one.release)
+            # Row numbers are used again after an erasure.
+            if release is None or (release.policy.sha256, release.released_at) != (one.sha256, one.released_at):
+                found[one] = (ERASED, "The style was erased."), None
+            elif release.withdrawn_at is not None:
+                found[one] = (WITHDRAWN, "The release was withdrawn."), None
+            elif not consent.may(release.policy.surgeon, "training"):
+                found[one] = (FORBIDDEN, "The surgeon's consent has ended."), None
+            else:
+                served = releases.served(session, release.policy.surgeon, release.suture)
+                newer = served is not None and served.row != release.row
+                found[one] = None, served.policy.version if served is not None and newer else None
+        return found
 
 
-def _judged(pinned: Pinned, row: Any) -> Found:
-    # Row numbers are used again after an erasure.
-    if row is None or (row.sha256, row.released_at) != (pinned.sha256, pinned.released_at):
-        return (ERASED, "The style was erased."), None
-    if row.withdrawn_at is not None:
-        return (WITHDRAWN, "The release was withdrawn."), None
-    if not consent.may(row, "training"):
-        return (FORBIDDEN, "The surgeon's consent has ended."), None
-    return None, None if row.newest == pinned.version else row.newest
-
-
-def _note(looking: set[Follower], found: dict[Pinned, Found]) -> None:
+def _tell(looking: set[Follower], found: dict[Pinned, Found]) -> None:
     for one in looking:
         why, one.newer_version = found[one.pinned]
         if why is not None:

@@ -218,7 +218,7 @@ def asked(database: Database, engine: Engine, **what: object) -> int:
     with database.reading() as session:
         told = attempts_to_submit(session, job)
     for row, attempt in told:
-        engine.tell(row, attempt, PART)
+        engine.submit(row, attempt, PART)
     return job.row
 
 

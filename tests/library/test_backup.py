@@ -272,7 +272,7 @@ def test_a_demo_erased_and_added_again_before_the_backup_is_not_erased(
 def test_a_list_of_erasures_never_shrinks_and_is_refused_if_altered(database: Database, tmp_path: Path):
     kept = tmp_path / "erasures.json"
     at = datetime(2026, 1, 1, tzinfo=UTC)
-    earlier = Erasures(frozenset({("00", "11" * 32, at)}), {"demonstrations": {"ab" * 32: at}})
+    earlier = Erasures({"11" * 32: ("00", at)}, {"demonstrations": {"ab" * 32: at}})
     assert keep_erasures(database, kept).surgeons == {}
     with database.writing() as session:
         erase_surgeon(session, "kestrel", "test")

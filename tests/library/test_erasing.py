@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import event, insert, select, text
 
 from skills import db
-from skills.db import history
+from skills.db import leaves, logged_rows
 from skills.db.models import Demonstration, MeasuredShape, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.db.service_tables import Job
 from skills.db.session import Database
@@ -270,7 +270,8 @@ def many_jobs(database: Database, count: int) -> None:
 
 def test_erasing_binds_no_more_parameters_for_more_rows(database: Database, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(db, "PARAMETERS", 7)
-    monkeypatch.setattr(history, "ROWS_AT_ONCE", 7)
+    for module in (leaves, logged_rows):
+        monkeypatch.setattr(module, "ROWS_AT_ONCE", 7)
     most: list[int] = []
 
     def count(_connection: Any, _cursor: Any, _statement: str, parameters: Any, _context: Any, many: bool) -> None:
