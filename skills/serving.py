@@ -36,8 +36,8 @@ from skills.client import Client
 from skills.compiled import check_cache_setting
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
-from skills.jobs.readiness import align_once, warm_up
-from skills.library.operation.backup import keep_erasures, keep_up_erasures
+from skills.jobs.warm_up import align_once, warm_up
+from skills.library.operation.erasure_list import keep_erasures, keep_up_erasures
 from skills.library.people.keys import refuse_without_keys
 from skills.remedies import Action, Remedy
 from skills.samples import load_samples

@@ -56,9 +56,7 @@ def compile_loops() -> None:
             continue
         cached = [file.stat().st_mtime for file in module.parent.glob(f"__pycache__/{module.stem}.*.nbi")]
         if not cached or min(cached) < module.stat().st_mtime:
-            code = (
-                "import skills.jobs.readiness as w, skills.formats.reader_process as c; w.learn_once(); c.get_ready()"
-            )
+            code = "import skills.jobs.warm_up as w, skills.formats.reader_process as c; w.learn_once(); c.get_ready()"
             subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
             return
 
@@ -173,48 +171,6 @@ def shared_statements() -> Iterator[None]:
         for dialect in (PGDialect_psycopg, SQLiteDialect_pysqlite):
             patched.setattr(dialect, "__eq__", lambda one, other: type(one) is type(other))
             patched.setattr(dialect, "__hash__", lambda one: hash(type(one)))
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def shared_tables() -> Iterator[None]:
-    """Let restores into SQLite copy tables that were migrated once, instead of migrating from the first revision on.
-
-    That takes half of a restore; `tests/migrations` migrates.
-    """
-    from skills.db import dump
-    from skills.db.revisions import revision_of, revisions
-    from tests import backends
-
-    migrate = dump.upgrade
-
-    def upgrade(connection: Any, to: str = "head") -> None:
-        if connection.dialect.name == "sqlite" and to == revisions()[0] and revision_of(connection) is None:
-            for statement in backends.tables():
-                connection.exec_driver_sql(statement)
-        else:
-            migrate(connection, to)
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(dump, "upgrade", upgrade)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def shared_document() -> Iterator[None]:
-    """Let all applications of a process share its OpenAPI document, which takes most of a second to build."""
-    from skills.api.app import Service
-
-    build = Service.openapi
-    built: list[dict[str, Any]] = []
-
-    def openapi(application: Service) -> dict[str, Any]:
-        if not built:
-            built.append(build(application))
-        return built[0]
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Service, "openapi", openapi)
         yield
 
 

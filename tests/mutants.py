@@ -372,9 +372,9 @@ GUARDS = (
     Guard(
         "skills/library/operation/history.py", 12,
         ("tests/api/test_edited_rows.py", "tests/api/test_rollback.py", "tests/library/test_history.py"),
-        ("edited_rows", "refuse_edited", "_is_signed", "covered_leaf", "is_right", "keep_signed"),
+        ("edited_rows", "refuse_edited", "_is_signed", "covered_leaf", "is_last_signed", "sign_some_history"),
     ),
-    Guard("skills/db/kept_heads.py", 8, ("tests/api/test_rollback.py", "tests/library/test_history.py")),
+    Guard("skills/db/saved_heads.py", 8, ("tests/api/test_rollback.py", "tests/library/test_history.py")),
     Guard(
         "skills/library/policies/releases.py", 33,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_scenes.py",
@@ -394,7 +394,7 @@ GUARDS = (
         ("tests/api/test_policy_cache.py", *(f"tests/api/test_served.py::test_{name}" for name in (
             "erased_policies_leave_all_processes_memory_without_a_request",
             "the_short_way_and_the_long_one_give_the_same_answers",
-            "a_policy_at_hand_is_not_given_to_whoever_may_not_see_it",
+            "a_cached_policy_is_not_given_to_whoever_may_not_see_it",
             "a_policy_learnt_again_after_an_erasure_gets_its_own_dates",
         ))),
     ),
@@ -412,7 +412,8 @@ GUARDS = (
     ),
     Guard("skills/library/policies/relearning.py", 16, ("tests/library/test_relearning.py",)),
     Guard(
-        "skills/library/operation/backup.py", 20, ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
+        "skills/library/operation/erasure_list.py", 20,
+        ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
         ("Erasures", "_latest", "_knows", "_later", "_listed", "_in_order", "_end_again", "_mark_again", "_here",
          "_narrow", "_both"),
     ),

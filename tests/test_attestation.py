@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from skills.errors import BadSignature, Corrupt
-from skills.transparency import LONGEST, Checkpoint, PublicKey, SigningKey, Statement, Tree, attest, pae, read_envelope
+from skills.transparency.merkle import Checkpoint, Tree
+from skills.transparency.signing_keys import PublicKey, SigningKey
+from skills.transparency.statements import LONGEST, Statement, attest, pae, read_envelope
 from tests.independent_history import check_envelope
 
 KEY, ORIGIN = SigningKey(bytes(range(32))), "suture-skills/0123456789abcdef"
@@ -69,7 +71,7 @@ def signed(payload: object, payload_type: str = "application/vnd.in-toto+json") 
     return json.dumps(body).encode()
 
 
-WHOLE = json.loads(read_envelope(SIGNED).payload)
+WHOLE = json.loads(base64.b64decode(read_envelope(SIGNED).payload))
 
 
 @pytest.mark.parametrize(

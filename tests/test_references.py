@@ -18,7 +18,7 @@ import pytest
 from typer.main import get_command
 
 import skills
-from skills.api.routes import comparison, operating, pages, plans, recordings
+from skills.api.routes import comparison, operating, pages, plans, recordings, sign_in
 from skills.cli import app
 from tests.api.conformance import conformance
 
@@ -40,7 +40,7 @@ UNDESCRIBED = (
     recordings.page_router,
     comparison.page_router,
     plans.timeline_page_router,
-    operating.sign_in_router,
+    sign_in.sign_in_router,
     operating.reference_router,
 )
 CALL = re.compile(r"\b(?:GET|POST|PUT|DELETE) (/[^\s`\"'?,)|]+)")

@@ -9,19 +9,19 @@ from hypothesis import strategies as some
 from skills.db.logged_rows import compact
 from skills.errors import Corrupt
 from skills.packing import canonical
-from skills.transparency import (
+from skills.transparency.merkle import (
     TILE_WIDTH,
     Checkpoint,
-    SigningKey,
     Tree,
     inclusion_proof,
     leaf_hash,
     node_from,
     node_hash,
     proven_root,
-    read_notes,
     root_of,
 )
+from skills.transparency.notes import read_notes
+from skills.transparency.signing_keys import SigningKey
 from tests.independent_history import check_inclusion, root_in
 
 # The published test data of Certificate Transparency: eight entries, and the root after each.

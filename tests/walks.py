@@ -40,13 +40,13 @@ COMMON += (
     "library/people/keys.py",
     "library/operation/locks.py",
 )
-COMMON += ("library/operation/history.py", "transparency.py")  # what is written is logged, whoever writes it
+COMMON += ("library/operation/history.py", "transparency/")  # what is written is logged, whoever writes it
 ONCE = ("find_plan", "time_parametrise", "stack", "plan_identity")
-PERIODIC = ("forget_erased", "forget_gone", "_sweep", "is_right")  # part of no request, and a slow walk has them
+PERIODIC = ("forget_erased", "forget_gone", "_sweep", "is_last_signed")  # part of no request, and a slow walk has them
 STARTING = ("confined_reader", "stated_errors", "migrate", "seed_catalogue", "create_app")  # called once by the service
 # Numbers, bytes and words: a reader knows them after the first page, and stays in the room that calls them.
 TOOLS = ("arrays.py", "arithmetic.py", "quaternions.py", "kinematics.py", "compiled.py", "packing.py", "fields.py")
-TOOLS += ("errors.py", "remedies.py", "settings.py", "logs.py", "transparency.py", "transparency")
+TOOLS += ("errors.py", "remedies.py", "settings.py", "logs.py", "transparency")
 
 
 def room(file: str) -> str:

@@ -58,7 +58,10 @@ NOTED = {  # by logged table, its key, and the columns that may change: a note n
     "suture_types": (("slug",), "slug name also_called family description"),
     "demonstrations": (("row",), "withdrawn_at"),
     "erased_intervals": (("row",), ""),
-    "jobs": (("row",), "row id kind identity state request result error surgeon_row plan asked_by created_at ended_at"),
+    "jobs": (
+        ("row",),
+        "row id kind identity state request result error surgeon_row plan requested_by created_at ended_at",
+    ),
     "key_surgeons": (("key_row", "surgeon_row"), "key_row surgeon_row"),
     "parsed_recordings": (("recording_row",), "recording_row version reading sha256"),
     "proposal_marks": (("row",), ""),
@@ -127,7 +130,7 @@ def upgrade() -> None:
         sa.Column("id", sa.String(length=64), nullable=False),
         sa.Column("beat_at", MOMENT, nullable=False),
         sa.Column("verified_at", MOMENT, nullable=True),
-        sa.Column("found", sa.Integer(), nullable=True),
+        sa.Column("faults_found", sa.Integer(), nullable=True),
         sa.PrimaryKeyConstraint("id", name="pk_executors"),
     )
     op.create_table(
@@ -302,8 +305,8 @@ def upgrade() -> None:
         sa.Column("attempt", sa.Integer(), nullable=False),
         sa.Column("surgeon_row", ROW, nullable=True),
         sa.Column("plan", sa.String(length=64), nullable=True),
-        sa.Column("asked_by", sa.String(length=200), nullable=False),
-        sa.Column("told_at", MOMENT, nullable=True),
+        sa.Column("requested_by", sa.String(length=200), nullable=False),
+        sa.Column("submitted_at", MOMENT, nullable=True),
         sa.Column("created_at", MOMENT, nullable=False),
         sa.Column("started_at", MOMENT, nullable=True),
         sa.Column("ended_at", MOMENT, nullable=True),

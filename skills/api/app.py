@@ -14,18 +14,32 @@ from starlette.middleware.errors import ServerErrorMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skills import __version__
-from skills.api.authentication import Access, Gate
+from skills.api.authentication import Access
+from skills.api.encoded_policies import Encoded
+from skills.api.gate import Gate
+from skills.api.job_events import Watching
 from skills.api.metrics import Observed, ServiceMetrics
 from skills.api.openapi import complete
-from skills.api.policy_cache import AtHand, PolicyCache
+from skills.api.policy_cache import CachedPolicyMiddleware, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
-from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import comparison, datasets, demos, operating, pages, people, plans, policies, recordings
+from skills.api.routes import (
+    comparison,
+    datasets,
+    demos,
+    operating,
+    pages,
+    people,
+    plans,
+    policies,
+    recordings,
+    sign_in,
+)
 from skills.api.sessions import Sessions
+from skills.api.streams import DOWNLOADS_READ
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
 from skills.jobs import Engine
-from skills.library.operation.history import keep_signed
+from skills.library.operation.history import sign_some_history
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.recordings.recordings import confined_reader
@@ -60,7 +74,7 @@ def create_app(settings: Settings) -> FastAPI:
                 with confined_reader(settings) as app.state.reader:
                     yield
             with suppress(SkillsError):  # what was written after the last signature; the next start signs it otherwise
-                await to_thread.run_sync(keep_signed, app.state.database, inf)
+                await to_thread.run_sync(sign_some_history, app.state.database, inf)
         finally:
             await to_thread.run_sync(app.state.engine.close)
             app.state.access.close()
@@ -84,7 +98,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.watching = Watching(app.state.database, app.state.served.changes, settings)
     app.state.metrics = ServiceMetrics(app.state.database, settings.lease_s)
     app.state.sessions = Sessions(app.state.database, app.state.served.changes, settings)
-    app.state.metrics.sessions.set_function(lambda: app.state.sessions.count)
+    app.state.metrics.sessions.set_function(lambda: app.state.sessions.places.count)
     app.state.downloads = CapacityLimiter(DOWNLOADS_READ)
     app.state.access = Access(app.state.database, settings)
     # `include_router` would analyse every route again, at the first request of each application: 90 ms.
@@ -112,7 +126,7 @@ def create_app(settings: Settings) -> FastAPI:
         recordings.page_router,
         comparison.page_router,
         plans.timeline_page_router,
-        operating.sign_in_router,
+        sign_in.sign_in_router,
         people.key_router,
     ):
         app.router.routes.extend(router.routes)
@@ -130,7 +144,7 @@ def prepare_database(database: Database, settings: Settings) -> None:
     database.compare_history()
     with database.writing() as session:
         seed_suture_types(session)
-    keep_signed(database)
+    sign_some_history(database)
 
 
 def prepare_to_serve(database: Database, settings: Settings) -> None:
@@ -161,8 +175,8 @@ class Service(FastAPI):
         state = self.state
         failing = super().build_middleware_stack()
         assert isinstance(failing, ServerErrorMiddleware)  # the handler of status 500 is outermost, and stays so
-        at_hand = AtHand(failing.app, state.served, policies.get_policy, policies.router)
-        failing.app = Gate(at_hand, state.access, state.settings, state.database.history)
+        cached = CachedPolicyMiddleware(failing.app, state.served, policies.get_policy, policies.router)
+        failing.app = Gate(cached, state.access, state.settings, state.database.history)
         return Observed(Headers(HeadAsGet(failing)), state.metrics)
 
 

@@ -32,7 +32,7 @@ from skills import __version__
 from skills.db.revisions import revisions
 from skills.db.session import Database
 from skills.errors import SkillsError
-from skills.library.operation.overview import Condition, condition_of, count_jobs
+from skills.library.operation.installation import Condition, condition_of, count_jobs
 from skills.logs import log_fields, request_id
 
 MANY_JOBS = 100_000  # ours: counting them takes 10 to 20 ms
@@ -152,23 +152,25 @@ def _figures(found: Condition) -> Iterator[Metric]:
         for quantile, seconds in quantiles.items():
             took.add_metric((kind, str(quantile)), seconds)
     yield took
-    yield GaugeMetricFamily(
-        "skills_oldest_queued_seconds", "Waiting time of the oldest queued job.", found.oldest_queued_s
-    )
-    yield GaugeMetricFamily("skills_workers", "Workers that renewed their lease in time.", found.workers)
-    yield GaugeMetricFamily("skills_database_bytes", "Size of the database.", found.database_bytes)
-    if found.verified_at is not None and found.found is not None:
-        yield GaugeMetricFamily("skills_history_faults", "Faults that the last verification found.", found.found)
-        yield GaugeMetricFamily(
-            "skills_history_verified_timestamp_seconds",
+    verified_at, last_event_at = found.verified_at, found.last_event_at
+    for name, meaning, value in (
+        ("oldest_queued_seconds", "Waiting time of the oldest queued job.", found.oldest_queued_s),
+        ("workers", "Workers that renewed their lease in time.", found.workers),
+        ("database_bytes", "Size of the database.", found.database_bytes),
+        ("history_faults", "Faults that the last verification found.", found.faults_found),
+        (
+            "history_verified_timestamp_seconds",
             "Time at which a worker last verified the history.",
-            found.verified_at.timestamp(),
-        )
-    if found.last_event_at is not None:
-        last = found.last_event_at.timestamp()
-        yield GaugeMetricFamily(
-            "skills_last_event_timestamp_seconds", "Time at which the last event was written.", last
-        )
+            None if verified_at is None else verified_at.timestamp(),
+        ),
+        (
+            "last_event_timestamp_seconds",
+            "Time at which the last event was written.",
+            None if last_event_at is None else last_event_at.timestamp(),
+        ),
+    ):
+        if value is not None:
+            yield GaugeMetricFamily(f"skills_{name}", meaning, value)
 
 
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"})

@@ -15,7 +15,7 @@ from typing import Any
 
 from fastapi import APIRouter, Response
 
-from skills.api.authentication import is_open
+from skills.api.gate import is_open
 from skills.schemas import Given
 from skills.schemas.given import Problem
 from skills.schemas.operation import Job

@@ -18,13 +18,15 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skills.api.authorisation import Needs
-from skills.api.responses import KEPT_BYTES, Body, Encoded, answer, negotiate
-from skills.db.changes import Unasked, WeightedCache, changes_of
+from skills.api.encoded_policies import KEPT_BYTES, Encoded, negotiate
+from skills.api.responses import Body, answer
+from skills.db.changes import Unasked, changes_of
 from skills.db.session import Database
+from skills.db.weighted_cache import WeightedCache
 from skills.errors import Busy, SkillsError, UnknownFormat
 from skills.library.comparison import neighbours
 from skills.library.operation import integrity
-from skills.library.operation.history import is_right, sign_history
+from skills.library.operation.history import is_last_signed, sign_history
 from skills.library.operation.proofs import first_head
 from skills.library.people import consent
 from skills.library.policies import versions
@@ -79,7 +81,7 @@ class PolicyCache:
                 await sweeping
             await self.changes.close()
 
-    def at_hand(self, surgeon: str, suture: str, media_type: str) -> Body | None:
+    def cached(self, surgeon: str, suture: str, media_type: str) -> Body | None:
         """Return the current policy of a style from the cache; None if that would need a query that blocks."""
         version = self.changes.version()  # read before the tables, so that a commit in between is not missed
         known = self._known.get((surgeon, suture, media_type))
@@ -101,7 +103,7 @@ class PolicyCache:
             NotFound: The style does not exist, or has no released policy.
             Corrupt: The stored policy does not match the digest that was certified.
         """
-        return self.at_hand(surgeon, suture, media_type) or await self._read(surgeon, suture, media_type)
+        return self.cached(surgeon, suture, media_type) or await self._read(surgeon, suture, media_type)
 
     async def _read(self, surgeon: str, suture: str, media_type: str) -> Body:
         version = self.changes.version()  # read before the tables, so that a commit in between is not missed
@@ -130,7 +132,7 @@ class PolicyCache:
     def _seen(self, key: Style) -> Known | None:
         """Read the tables, all within one transaction; None where the release is under no signed checkpoint yet."""
         surgeon, suture, media_type = key
-        kept = self._database.history.kept_head()
+        kept = self._database.history.saved_head()
         with self._database.reading() as session:
             self._database.history.compare(session.connection(), kept)
             release = session.execute(STANDS, {"surgeon": surgeon, "suture": suture}).first()
@@ -156,7 +158,7 @@ class PolicyCache:
         while True:
             await asyncio.sleep(SWEEP_S)
             with suppress(SkillsError, SQLAlchemyError):  # the database may be readable again at the next sweep
-                await asyncio.to_thread(is_right, self._database)  # sets `History.refused`
+                await asyncio.to_thread(is_last_signed, self._database)  # sets `History.refused`
                 await asyncio.to_thread(self.forget_erased)
                 await asyncio.to_thread(neighbours.forget_gone, self._database)
 
@@ -172,7 +174,7 @@ class PolicyCache:
         self._known.forget([key for key, known in self._known.items() if known.release[-1] in gone])
 
 
-class AtHand:
+class CachedPolicyMiddleware:
     """ASGI middleware that answers GET of a released policy from the cache: no routing, but the route's authorisation.
 
     It stands between the authentication and the application. A request that needs a query, has an unusual header or is
@@ -205,7 +207,7 @@ class AtHand:
         if found is None or asked is None:
             return None
         media_type, if_none_match = asked
-        body = self._served.at_hand(found["surgeon"], found["suture"], media_type)
+        body = self._served.cached(found["surgeon"], found["suture"], media_type)
         if body is None:
             return None
         # read by the authorisation and by the metrics

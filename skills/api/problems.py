@@ -63,12 +63,7 @@ def problem(
 ) -> Response:
     """Return a problem document as a response."""
     body = {"type": f"urn:suture-skills:{kind}", "title": title, "status": status, "detail": detail, **more}
-    return Response(
-        orjson.dumps(body, default=str),
-        status,
-        headers=headers,
-        media_type="application/problem+json",
-    )
+    return Response(orjson.dumps(body, default=str), status, headers=headers, media_type="application/problem+json")
 
 
 SHOWN = 1e12  # larger numbers are not repeated in messages

@@ -15,7 +15,6 @@ sends the reason: a client that does not read cannot hold up a watcher.
 
 import asyncio
 import logging
-from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -33,10 +32,11 @@ from sqlalchemy.orm import aliased
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from skills.api.authentication import Bucket
 from skills.api.authorisation import Caller
-from skills.api.dependencies import strictly_read
+from skills.api.places import Places
+from skills.api.rate_limits import Bucket
 from skills.api.responses import json_of
+from skills.api.strict_json import strictly_read
 from skills.db.changes import Changes, Unasked
 from skills.db.models import PolicyVersion, Release, Surgeon
 from skills.db.session import Database
@@ -157,18 +157,14 @@ class Sessions:
 
     def __init__(self, database: Database, changes: Changes, settings: Settings) -> None:
         self._database, self._changes = database, changes
-        self._most_of_key, self._idle_s = settings.key_sessions, settings.session_idle_s
+        self._idle_s = settings.session_idle_s
+        full = TooMany("Too many sessions are open; close one, or request single poses.", AGAIN_S)
+        self.places = Places(settings.key_sessions, full, MOST)
         self._open: set[Follower] = set()
-        self._of_key: Counter[str] = Counter()
         self._watching: list[asyncio.Task[None]] = []
         self._version: int | None = None  # of the database at the last look
         self._rows_seen: dict[Pinned, tuple[Any, ...] | None] | None = None  # and the rows that it judged
         self._known_s = 0.0  # when the last look began that was answered
-
-    @property
-    def count(self) -> int:
-        """The number of open sessions."""
-        return self._of_key.total()
 
     async def serve(self, socket: WebSocket, surgeon: str, suture: str) -> None:
         """Serve one session until it ends.
@@ -177,7 +173,7 @@ class Sessions:
             SkillsError: It is refused before it is opened: too many are open, or nothing is served.
         """
         caller: Caller = socket.scope["caller"]
-        with self._place(caller.key):
+        with self.places.place(caller.key):
             began_s = monotonic()
             pinned = await to_thread.run_sync(_pin, self._database.seen_by(caller.only), surgeon, suture)
             task = asyncio.current_task()
@@ -235,24 +231,6 @@ class Sessions:
             **{"scene": None if poses.scene is None else as_json(poses.scene), "limits": limits},
         }
         return json_of(said).decode()
-
-    @contextmanager
-    def _place(self, key: str | None) -> Iterator[None]:
-        """Count a session while it is open.
-
-        Raises:
-            TooMany: The key has as many sessions open as it may, or this process has.
-        """
-        mine = key or ""  # a local caller is counted, and has no limit of its own
-        if self.count >= MOST or (key is not None and self._of_key[key] >= self._most_of_key):
-            raise TooMany("Too many sessions are open; close one, or request single poses.", AGAIN_S)
-        self._of_key[mine] += 1
-        try:
-            yield
-        finally:
-            self._of_key[mine] -= 1
-            if not self._of_key[mine]:
-                del self._of_key[mine]
 
     @contextmanager
     def _watched(self, follower: Follower, began_s: float) -> Iterator[None]:

@@ -42,7 +42,7 @@ from skills.errors import BadInput, SkillsError
 from skills.remedies import Door, did_you_mean
 
 if TYPE_CHECKING:
-    from skills.transparency import PublicKey
+    from skills.transparency.signing_keys import PublicKey
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document; errors too, on stderr.")]
 Surgeon = Annotated[str, typer.Argument(help="The surgeon's pseudonym.", autocompletion=complete_surgeons)]
@@ -276,7 +276,7 @@ def read_json(path: Path, described: str, remedy: str) -> Any:
 
 def read_key(key: str) -> "PublicKey":
     """Read a public key from the text of an option, or from the file that it names."""
-    from skills.transparency import PublicKey
+    from skills.transparency.signing_keys import PublicKey
 
     return PublicKey.read(key if key.count("+") >= 2 and not Path(key).exists() else Path(key).read_text())
 

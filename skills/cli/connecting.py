@@ -41,7 +41,7 @@ def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
     from starlette.testclient import TestClient
 
     from skills.api.app import create_app
-    from skills.library.operation.backup import keep_up_erasures
+    from skills.library.operation.erasure_list import keep_up_erasures
     from skills.serving import working
 
     app = create_app(settings)

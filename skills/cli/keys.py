@@ -76,7 +76,7 @@ def _database() -> Iterator["Database"]:
         database.migrate()
         yield database
         if (file := settings().erasures_file) is not None:
-            from skills.library.operation.backup import keep_up_erasures
+            from skills.library.operation.erasure_list import keep_up_erasures
 
             keep_up_erasures(database, file)
 

@@ -13,7 +13,7 @@ from skills.cli.output import Answer, err, outcome, say, status_line, table, war
 from skills.errors import NotReady, SkillsError
 
 if TYPE_CHECKING:
-    from skills.library.operation.backup import Erasures
+    from skills.library.operation.erasure_list import Erasures
     from skills.library.operation.inspection import Checked
 
 commands = typer.Typer()
@@ -137,7 +137,7 @@ def restore(
     That is, erasures, withdrawals, revoked keys and narrowed consents, from the lists of --erasures.
     """
     from skills.db.session import Database
-    from skills.jobs.readiness import refuse_left_over
+    from skills.jobs import refuse_left_over
     from skills.library.operation import backup as library
     from skills.settings import settings
 
@@ -163,7 +163,7 @@ def accept_rollback(erasures: Lists = None) -> Answer:
     history are set aside. Restore the right copy instead where there is one.
     """
     from skills.db.session import Database
-    from skills.jobs.readiness import refuse_left_over
+    from skills.jobs import refuse_left_over
     from skills.library.operation import backup as library
     from skills.settings import settings
 
@@ -187,13 +187,13 @@ def _ended(sentence: str, sources: list[str], since: str, **facts: Any) -> Answe
 
 def _listed_in(given: list[str] | None) -> tuple[list[str], "Erasures"]:
     """Return the lists of erasures to apply, by default the file of the settings, and their union."""
-    from skills.library.operation import backup as library
+    from skills.library.operation.erasure_list import NOTHING, read_erasures
     from skills.settings import settings
 
-    kept, listed = settings().erasures_file, library.NOTHING
+    kept, listed = settings().erasures_file, NOTHING
     sources = given or ([str(kept)] if kept is not None and kept.exists() else [])
     for one in sources:
-        listed |= library.read_erasures(one)
+        listed |= read_erasures(one)
     return sources, listed
 
 
@@ -214,7 +214,7 @@ def erasures(
 ) -> Answer:
     """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`."""
     from skills.db.session import Database
-    from skills.library.operation.backup import keep_erasures
+    from skills.library.operation.erasure_list import keep_erasures
     from skills.settings import settings
 
     with closing(Database(settings().database_url)) as database:
@@ -265,11 +265,11 @@ def verify(
         lines = list(verify_bag(bag, None if key is None else read_key(key)))
         return outcome("\n".join(lines), whole=True, checked=lines)
     from skills.db.session import Database
-    from skills.library.operation.history import keep_signed
+    from skills.library.operation.history import sign_some_history
     from skills.library.operation.inspection import inspect_installation
     from skills.library.recordings.recordings import confined_reader
     from skills.settings import settings
-    from skills.transparency import read_notes
+    from skills.transparency.notes import read_notes
 
     found: dict[str, Checked] = {}
     with (
@@ -278,7 +278,7 @@ def verify(
         status_line("verifying") as update,
     ):
         heads = None if head is None else read_notes(head.read_text())
-        keep_signed(database)
+        sign_some_history(database)
         for part in inspect_installation(
             database,
             reader.parse,

@@ -323,7 +323,7 @@ def policy_verify(
     key: Key,
 ) -> Answer:
     """Check offline that the service with this key signed exactly this file, and print what it said of it."""
-    from skills.transparency import read_envelope
+    from skills.transparency.statements import read_envelope
 
     content, envelope = file.read_bytes(), read_envelope(signature.read_bytes())
     statement = envelope.statement_by(read_key(key))

@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
-from sqlalchemy import BigInteger, DateTime, Dialect, Integer, MetaData, String
+from sqlalchemy import BigInteger, DateTime, Dialect, Index, Integer, MetaData, String, text
 from sqlalchemy.orm import DeclarativeBase, mapped_column
 from sqlalchemy.sql.operators import OperatorType
 from sqlalchemy.types import JSON, TypeDecorator, TypeEngine
@@ -115,6 +115,11 @@ RowId = Annotated[
 Number = Annotated[int, mapped_column(BigInteger().with_variant(Integer, "sqlite"))]  # a row, without a foreign key
 Sha256 = String(64)
 Slug = String(64)
+
+
+def partial_index(name: str, *columns: str, where: str, unique: bool = False) -> Index:
+    """Return an index of the rows that meet a condition, on either database."""
+    return Index(name, *columns, unique=unique, sqlite_where=text(where), postgresql_where=text(where))
 
 
 def in_parts(rows: Sequence[int]) -> Iterator[Sequence[int]]:

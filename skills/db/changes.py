@@ -1,4 +1,4 @@
-"""Caches, and the detection of changes to served policies, checked at every request without reading a table.
+"""Detection of changes to served policies, checked at every request without reading a table.
 
 `Changes.version()` is a number: as long as it stays the same, no commit has changed the served policies. Callers read
 it before they read the tables, never after. None means that changes cannot be detected now, so the tables must be read.
@@ -17,17 +17,13 @@ import asyncio
 import logging
 import secrets
 import sqlite3
-from collections.abc import Callable, Iterable
 from contextlib import suppress
-from copy import copy
 from functools import cache
 from itertools import count
 from pathlib import Path
-from threading import Lock
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any
 
-from cachetools import LRUCache
 from sqlalchemy import Engine, Select, event, text
 from sqlalchemy.orm import Session
 
@@ -42,10 +38,7 @@ BOUND_S = 1.5  # two heartbeats may be late; after that the tables are read at e
 GIVEN_UP_S = 5  # a connection without heartbeats for this long is replaced
 AGAIN_S = 0.5  # between two attempts to connect
 APPLICATION = "suture-skills listening"  # its name in pg_stat_activity
-
 log = logging.getLogger(__name__)
-K = TypeVar("K")
-V = TypeVar("V")
 
 
 def announce(session: Session) -> None:
@@ -244,46 +237,3 @@ class Notified(Changes):
         """Stop watching the connection's socket at once: the system may soon give its number to another socket."""
         asyncio.get_running_loop().remove_reader(socket)
         self._line = None
-
-
-# ---- cache ---------------------------------------------------------------------------------------------------------
-
-
-class WeightedCache(Generic[K, V]):
-    """A least-recently-used cache, bounded by the total weight of its values, under a lock: cachetools has none."""
-
-    def __init__(self, most: int, weight: Callable[[V], int] | None = None) -> None:
-        """Create an empty cache.
-
-        Args:
-            most: The upper bound of the total weight; a value that is heavier alone is not stored.
-            weight: Returns the weight of a value; by default each counts as one.
-        """
-        self._values: LRUCache[K, V] = LRUCache(most, weight)
-        self._lock = Lock()
-
-    def get(self, key: K) -> V | None:
-        """Return the value of a key, None if it is not cached, and mark it as most recently used."""
-        with self._lock:
-            try:
-                return self._values[key]
-            except KeyError:  # not `get`, which looks a key up twice, at every request
-                return None
-
-    def put(self, key: K, value: V) -> None:
-        """Store a value; the least recently used values are evicted as soon as the total weight exceeds the bound."""
-        with self._lock:
-            self._values.pop(key, None)  # first, because an older value must not outlive one that is too heavy
-            if self._values.getsizeof(value) <= self._values.maxsize:
-                self._values[key] = value
-
-    def items(self) -> list[tuple[K, V]]:
-        """Return a list of the cached keys and values, without marking any as used."""
-        with self._lock:
-            return list(copy(self._values).items())  # of a copy, because every look-up moves a key to the end
-
-    def forget(self, keys: Iterable[K]) -> None:
-        """Remove keys from the cache."""
-        with self._lock:
-            for key in keys:
-                self._values.pop(key, None)

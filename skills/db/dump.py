@@ -13,11 +13,11 @@ import hashlib
 import io
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import IO, Any
+from typing import IO, Any, Final, Literal
 from zipfile import ZIP_STORED, ZipFile
 
+from pydantic import BaseModel
 from sqlalchemy import Column, Connection, MetaData, Table, insert, select, text
 
 from skills.db import Base, now, rfc3339
@@ -29,7 +29,7 @@ from skills.db.tiles import Tile
 from skills.errors import Conflict, Corrupt, UnknownFormat
 from skills.remedies import Action, Remedy
 
-FORMAT = "suture-skills backup 1"
+FORMAT: Final = "suture-skills backup 1"
 MANIFEST = "manifest.json"
 SEAL_BYTES = 64
 CUT_OFF = "its end is missing or damaged, as in a truncated file"
@@ -43,38 +43,36 @@ ROWS_AT_ONCE = 500
 ROWS_WITH_BYTES_AT_ONCE = 8  # a recording's chunk has 1 MiB
 
 
-@dataclass(frozen=True)
-class Dumped:
+class Dumped(BaseModel):
     """The manifest's entry of a table; `counter` is its autoincrement column, `last` the highest number ever used."""
 
     name: str
-    columns: list[list[str]]  # name and kind of each
+    columns: list[tuple[str, str]]  # name and kind of each
     rows: int
     sha256: str
     counter: str | None
     last: int
 
-    @property
-    def member(self) -> str:
-        """The name of its file in the archive."""
-        return f"{self.name}.rows"
 
-    @property
-    def table(self) -> Table:
-        """The table with raw columns: serialised values stay bytes."""
-        return Table(self.name, MetaData(), *(Column(name, KINDS[kind]) for name, kind in self.columns))
-
-
-@dataclass(frozen=True)
-class Manifest:
+class Manifest(BaseModel):
     """The contents of manifest.json."""
 
-    format: str
+    format: Literal["suture-skills backup 1"] = FORMAT
     code: str
-    schema: str
+    revision: str  # of the schema
     database: str
     created_at: str
     tables: list[Dumped]
+
+
+def member_of(table: str) -> str:
+    """Return the name of a table's file in the archive."""
+    return f"{table}.rows"
+
+
+def raw_table(name: str, columns: Sequence[tuple[str, str]]) -> Table:
+    """Return a table with raw columns: serialised values stay bytes."""
+    return Table(name, MetaData(), *(Column(column, KINDS[kind]) for column, kind in columns))
 
 
 def tables() -> list[Table]:
@@ -85,14 +83,14 @@ def tables() -> list[Table]:
 # ---- writing -----------------------------------------------------------------------------------------------------
 
 
-def write(file: IO[bytes], connection: Connection, code: str, told: Callable[[str], None]) -> Manifest:
+def write(file: IO[bytes], connection: Connection, code: str, progress: Callable[[str], None]) -> Manifest:
     """Write all tables into an empty file, from the caller's single transaction.
 
     Args:
         file: Empty; readable and seekable, because the digest is computed from it at the end.
         connection: In the transaction whose state is backed up.
         code: Version of the code, for the manifest.
-        told: Progress callback, called with the name of each table.
+        progress: Progress callback, called with the name of each table.
 
     Raises:
         Conflict: The tables are of another version of the code.
@@ -102,14 +100,16 @@ def write(file: IO[bytes], connection: Connection, code: str, told: Callable[[st
         raise Conflict(
             "The tables are of another version; back up with the code of that version.", Remedy(Action.MIGRATE)
         )
-    created_at = rfc3339(now()) or ""
     with ZipFile(file, "w", ZIP_STORED) as archive:
         dumped = []
         for table in tables():
-            told(table.name)
+            progress(table.name)
             dumped.append(_write_table(archive, connection, table))
-        manifest = Manifest(FORMAT, code, schema, connection.dialect.name, created_at, dumped)
-        archive.writestr(MANIFEST, json.dumps(asdict(manifest), indent=1))
+        database = connection.dialect.name
+        manifest = Manifest(
+            code=code, revision=schema, database=database, created_at=rfc3339(now()) or "", tables=dumped
+        )
+        archive.writestr(MANIFEST, manifest.model_dump_json(indent=1))
         archive.comment = b"0" * SEAL_BYTES  # replaced below: the digest covers the finished archive
     file.seek(-SEAL_BYTES, io.SEEK_END)
     end = file.tell()
@@ -120,24 +120,24 @@ def write(file: IO[bytes], connection: Connection, code: str, told: Callable[[st
 
 
 def _write_table(archive: ZipFile, connection: Connection, table: Table) -> Dumped:
-    columns = [[column.name, kind_of(column)] for column in table.columns]
+    columns = [(column.name, kind_of(column)) for column in table.columns]
     counter = table.autoincrement_column
     last = 0 if counter is None else _last_number(connection, table.name, counter.name)
-    raw = Dumped(table.name, columns, 0, "", None if counter is None else counter.name, last)
-    holds_bytes = any(kind == "bytes" for _, kind in columns)
-    query = select(raw.table).order_by(*(raw.table.c[key.name] for key in table.primary_key))
+    raw, holds_bytes = raw_table(table.name, columns), any(kind == "bytes" for _, kind in columns)
+    query = select(raw).order_by(*(raw.c[key.name] for key in table.primary_key))
     query = query.execution_options(yield_per=ROWS_WITH_BYTES_AT_ONCE if holds_bytes else ROWS_AT_ONCE)
     seen, rows = hashlib.sha256(), 0
-    with archive.open(raw.member, "w", force_zip64=True) as out:
+    with archive.open(member_of(table.name), "w", force_zip64=True) as out:
         for row in connection.execute(query):
             for piece in _lay_out(row, columns):
                 seen.update(piece)
                 out.write(piece)
             rows += 1
-    return Dumped(raw.name, raw.columns, rows, seen.hexdigest(), raw.counter, last)
+    of_counter = None if counter is None else counter.name
+    return Dumped(name=table.name, columns=columns, rows=rows, sha256=seen.hexdigest(), counter=of_counter, last=last)
 
 
-def _lay_out(row: Sequence[Any], columns: list[list[str]]) -> Iterator[bytes]:
+def _lay_out(row: Sequence[Any], columns: Sequence[tuple[str, str]]) -> Iterator[bytes]:
     line: list[Any] = []
     behind: list[bytes] = []
     for value, (_, kind) in zip(row, columns, strict=True):
@@ -171,32 +171,32 @@ def check(file: IO[bytes]) -> Manifest:
     try:
         with ZipFile(file) as archive:
             manifest = _manifest(archive)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, ValueError) as error:
         raise UnknownFormat("This zip file is not a backup of suture-skills that this version can read.") from error
-    if manifest.schema not in revisions():
+    if manifest.revision not in revisions():
         raise Conflict(
-            f"The backup was written by another version ({manifest.code}, its tables are at {manifest.schema}); "
+            f"The backup was written by another version ({manifest.code}, its tables are at {manifest.revision}); "
             "restore it with that one."
         )
     return manifest
 
 
-def load(file: IO[bytes], manifest: Manifest, connection: Connection, told: Callable[[str], None]) -> None:
+def load(file: IO[bytes], manifest: Manifest, connection: Connection, progress: Callable[[str], None]) -> None:
     """Create the tables, insert the rows of a backup, and migrate them to this version, in the caller's transaction.
 
     Args:
         file: The backup.
         manifest: Its manifest, from `check`.
         connection: In the transaction; the database is empty.
-        told: Progress callback, called with the name of each table.
+        progress: Progress callback, called with the name of each table.
     """
-    upgrade(connection, manifest.schema)
+    upgrade(connection, manifest.revision)
     with ZipFile(file) as archive:
         for dumped in manifest.tables:
-            told(dumped.name)
-            with archive.open(dumped.member) as member:
+            progress(dumped.name)
+            with archive.open(member_of(dumped.name)) as member:
                 for batch in _batches(io.BufferedReader(member, PIECE_BYTES), dumped):  # type: ignore[type-var]
-                    connection.execute(insert(dumped.table), batch)
+                    connection.execute(insert(raw_table(dumped.name, dumped.columns)), batch)
             if dumped.counter is not None and dumped.last:
                 _count_on_from(connection, dumped.name, dumped.counter, dumped.last)
     upgrade(connection)
@@ -223,10 +223,7 @@ def _batches(file: IO[bytes], dumped: Dumped) -> Iterator[list[dict[str, Any]]]:
 
 
 def _manifest(archive: ZipFile) -> Manifest:
-    said = json.loads(archive.read(MANIFEST))
-    if said["format"] != FORMAT:
-        raise ValueError(said["format"])
-    return Manifest(**said | {"tables": [Dumped(**one) for one in said["tables"]]})
+    return Manifest.model_validate_json(archive.read(MANIFEST))
 
 
 def _damage(file: IO[bytes]) -> str:
@@ -243,15 +240,15 @@ def _damage(file: IO[bytes]) -> str:
         except Exception:
             return f"{MANIFEST} is damaged"
         for dumped in manifest.tables:
-            if dumped.member not in archive.namelist():
-                return f"{dumped.member} is missing"
+            if member_of(dumped.name) not in archive.namelist():
+                return f"{member_of(dumped.name)} is missing"
             try:
-                with archive.open(dumped.member) as member:
+                with archive.open(member_of(dumped.name)) as member:
                     same = hashlib.file_digest(member, "sha256").hexdigest() == dumped.sha256  # type: ignore[arg-type]
             except Exception:
                 same = False
             if not same:
-                return f"{dumped.member} is damaged"
+                return f"{member_of(dumped.name)} is damaged"
     return "its members are intact, its directory or its last bytes are damaged"
 
 

@@ -16,8 +16,8 @@ from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import ArgumentError
 from sqlalchemy.pool import ConnectionPoolEntry
 
+from skills.db.change_notes import FORGET_NOTES, NOTING, NOTING_CONNECTION
 from skills.db.disk import make_private
-from skills.db.history import FORGET_NOTES, NOTING, NOTING_CONNECTION
 from skills.errors import BadSettings, DatabaseUnusable
 
 BUSY_TIMEOUT_MS = 10_000

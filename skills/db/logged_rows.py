@@ -7,10 +7,9 @@ constraints are logged as if each of them were a row.
 import hashlib
 import json
 import re
-from collections import namedtuple
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from functools import cache, cached_property
 from json.encoder import encode_basestring_ascii
 from typing import Any
@@ -23,7 +22,6 @@ from sqlalchemy import (
     Column,
     ColumnElement,
     Connection,
-    Dialect,
     Double,
     Float,
     Integer,
@@ -64,7 +62,7 @@ CACHES = ("measured_shapes", "parsed_recordings", "sign_ins")
 COLUMNS_NOT_LOGGED = {
     ("jobs", "progress"): OF_A_RUN,
     ("jobs", "attempt"): OF_A_RUN,
-    ("jobs", "told_at"): OF_A_RUN,
+    ("jobs", "submitted_at"): OF_A_RUN,
     ("jobs", "started_at"): OF_A_RUN,
     ("sign_ins", "used_at"): OF_A_RUN,
 }
@@ -111,34 +109,6 @@ class Logged:
         """The columns of the primary key."""
         return [self.raw.c[name] for name in self.keys]
 
-    @cached_property
-    def row(self) -> Callable[..., Any]:
-        """The class of a row as `changed_rows` returns it, with the logged columns."""
-        return namedtuple("row", self.columns)
-
-    @cache  # noqa: B019 - a few dialects and tables in a process
-    def readers(self, dialect: Dialect) -> list[tuple[int, Callable[[Any], Any]]]:
-        """Return the positions of the columns that have another form in `changed_rows`, with their conversions."""
-        read: list[Callable[[Any], Any] | None]
-        if dialect.name == "sqlite":
-            read = [column.type.dialect_impl(dialect).result_processor(dialect, None) for column in self.raw.columns]
-        else:
-            read = [_FROM_JSON.get(kind_of(self._mapped.c[name])) or self._number(name) for name in self.columns]
-        return [(at, one) for at, one in enumerate(read) if one is not None]
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """The quoted names of the columns."""
-        return tuple(f'"{name}"' for name in self.columns)
-
-    @cached_property
-    def of_bytes(self) -> tuple[int, ...]:
-        """The positions of the columns of bytes."""
-        return tuple(at for at, name in enumerate(self.columns) if kind_of(self._mapped.c[name]) == "bytes")
-
-    def _number(self, name: str) -> Callable[[Any], Any] | None:
-        return _float if isinstance(self._mapped.c[name].type, Float) else None
-
     @property
     def _mapped(self) -> Table:
         return Base.metadata.tables[self.raw.name]
@@ -177,15 +147,6 @@ class Logged:
             page = list(connection.execute(query.where(self.after(last))))
 
 
-def _float(value: Any) -> Any:
-    return None if value is None else float(value)
-
-
-_FROM_JSON: dict[str, Callable[[Any], Any]] = {  # as PostgreSQL writes them; in JSON the float 1.0 is 1
-    "moment": lambda value: None if value is None else datetime.fromisoformat(value).astimezone(UTC),
-}
-
-
 @cache
 def logged() -> Mapping[str, Logged]:
     """Return the logged tables by name, each after those that it refers to."""
@@ -198,58 +159,10 @@ def _logged(table: Table) -> Logged:
     return Logged(raw, tuple(one.name for one in table.primary_key))
 
 
-# ---- rows of several tables in one statement -------------------------------------------------------------------------
-
-OF_LEAF, _SALT = ("table_name", "key", '"row"', "entry", "salt", "digests"), (4,)  # columns of a leaf; those of bytes
-
-
-@cache
-def united(dialect: str, tables: tuple[str, ...], logged_before: tuple[str, ...]) -> tuple[str, list[tuple[int, ...]]]:
-    """Return one query of the rows of some tables and of the leaves of some, and the positions of bytes in each.
-
-    Each row begins with the number of its table; each table is asked for by one argument, the values of its key.
-    """
-    queries: list[tuple[tuple[str, ...], tuple[int, ...], str, str]] = []
-    for table in tables:
-        known = logged()[table]
-        kind = "text" if known.of_text else "bigint"
-        queries.append((known.names, known.of_bytes, f'{table} WHERE "{known.keys[0]}"', kind))
-    queries += [(OF_LEAF, _SALT, f"history WHERE table_name = '{table}' AND key", "text") for table in logged_before]
-    widest = max(len(columns) for columns, *_ in queries)
-    most = max(len(of_bytes) for _, of_bytes, *_ in queries)
-    parts = []
-    for number, (columns, of_bytes, compared, kind) in enumerate(queries):
-        if dialect == "sqlite":
-            selected = ", ".join((*columns, *("NULL",) * (widest - len(columns))))
-            parts.append(f"SELECT {number}, {selected} FROM {compared} IN (SELECT value FROM json_each(?))")  # noqa: S608
-        else:
-            plain = ", ".join("NULL" if at in of_bytes else column for at, column in enumerate(columns))
-            beside = [f", {columns[at]}" for at in of_bytes] + [", NULL::bytea"] * (most - len(of_bytes))
-            selected = f"json_build_array({plain})::text{''.join(beside)}"
-            parts.append(f"SELECT {number}, {selected} FROM {compared} = ANY(%s::{kind}[])")  # noqa: S608
-    return " UNION ALL ".join(parts), [of_bytes for _, of_bytes, *_ in queries]
-
-
-def united_rows(
-    connection: Connection, statement: str, of_bytes: Sequence[tuple[int, ...]], given: Sequence[Sequence[Any]]
-) -> Iterator[tuple[int, list[Any]]]:
-    """Yield the rows of a query of `united`, each with the number of its table."""
-    if connection.dialect.name == "sqlite":
-        keys = tuple(orjson.dumps(values).decode() for values in given)
-        for number, *row in connection.exec_driver_sql(statement, keys):
-            yield number, row
-        return
-    for number, as_json, *contents in connection.exec_driver_sql(statement, tuple(given)):
-        row = json.loads(as_json)
-        for at, content in zip(of_bytes[number], contents, strict=False):
-            row[at] = content
-        yield number, row
-
-
 # ---- digests of rows ------------------------------------------------------------------------------------------------
 
 
-def digests_of(names: Sequence[str], values: Sequence[Any], salt: bytes) -> dict[str, str]:
+def digests_of(names: Iterable[str], values: Iterable[Any], salt: bytes) -> dict[str, str]:
     """Return the salted digests of a row's columns in hex, by name."""
     return {
         name: hashlib.sha256(salt + name.encode() + as_bytes(value)).hexdigest()[: 2 * DIGEST_BYTES]

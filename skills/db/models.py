@@ -24,13 +24,12 @@ from sqlalchemy import (
     and_,
     func,
     select,
-    text,
 )
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from skills.comparison.distances import Measured
-from skills.db import AsJson, Base, Number, RowId, Sha256, Slug, now
+from skills.db import AsJson, Base, Number, RowId, Sha256, Slug, now, partial_index
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import Pause
@@ -300,12 +299,7 @@ class Demonstration(Base):
         Index("ix_demonstrations_style", "surgeon_row", "suture", "row"),
         Index("ix_demonstrations_surgeon", "surgeon_row", "row"),
         Index("ix_demonstrations_suture", "suture", "row"),
-        Index(
-            "ix_demonstrations_withdrawn",
-            "row",
-            sqlite_where=text("withdrawn_at IS NOT NULL"),
-            postgresql_where=text("withdrawn_at IS NOT NULL"),
-        ),
+        partial_index("ix_demonstrations_withdrawn", "row", where="withdrawn_at IS NOT NULL"),
     )
 
     @property

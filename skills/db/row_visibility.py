@@ -40,9 +40,9 @@ from skills.db.models import (
 from skills.db.service_tables import DatasetChunk, DatasetDemonstration, Job, StoredDataset, StyleToRetrain
 
 ONLY = "only"
-EVERYBODYS = {"everybodys": True}  # the execution option of a query that must see all rows
+ALL_ROWS = {"all_rows": True}  # the execution option of a query that must see all rows
 # Tables without a rule; a test checks that every other table has one.
-OF_NOBODY = (
+UNRESTRICTED_TABLES = (
     *("erasures", "suture_types", "calibrations", "executors", "events", "keys", "key_surgeons", "sign_ins"),
     *("recording_uploads", "loose_chunks", "erased_surgeons", "history", "history_checkpoints", "history_tiles"),
 )
@@ -127,5 +127,5 @@ def _narrow(asked: ORMExecuteState) -> None:
     only: Only | None = asked.session.info.get(ONLY)
     if only is None or not asked.is_select or asked.is_column_load or asked.is_relationship_load:
         return
-    if not asked.execution_options.get("everybodys"):
+    if not asked.execution_options.get("all_rows"):
         asked.statement = asked.statement.options(*only.criteria)

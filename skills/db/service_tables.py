@@ -19,13 +19,13 @@ from sqlalchemy import (
     Table,
     UniqueConstraint,
     insert,
-    text,
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
-from skills.db import Base, Number, RowId, Sha256, now
+from skills.db import Base, Number, RowId, Sha256, now, partial_index
 from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
+from skills.schemas.operation import JobState
 from skills.settings import Role
 
 LONGEST_REASON = 2000  # characters
@@ -36,8 +36,8 @@ class Job(Base):
 
     `identity` is the digest of its resolved inputs: there is at most one active or succeeded job of an identity.
     `plan` is the digest of the plan that a playback or pictures belong to. `attempt` is the number of the current
-    attempt; its workflow is named "<row>-<attempt>". `told_at` is the time at which the attempt was enqueued in the
-    engine; of a batch, the time since which all its styles have rows. The surgeon is no foreign key: an erased
+    attempt; its workflow is named "<row>-<attempt>". `submitted_at` is the time at which the attempt was enqueued in
+    the engine; of a batch, the time since which all its styles have rows. The surgeon is no foreign key: an erased
     surgeon's jobs are deleted in steps, after the surgeon.
     """
 
@@ -47,7 +47,7 @@ class Job(Base):
     id: Mapped[str] = mapped_column(String(32), unique=True)
     kind: Mapped[str] = mapped_column(String(20))
     identity: Mapped[str] = mapped_column(Sha256)
-    state: Mapped[str] = mapped_column(String(10), default="queued")
+    state: Mapped[JobState] = mapped_column(String(10), default="queued")
     progress: Mapped[float] = mapped_column(default=0.0)
     request: Mapped[dict[str, Any]]
     result: Mapped[dict[str, Any] | None]
@@ -55,8 +55,8 @@ class Job(Base):
     attempt: Mapped[int] = mapped_column(default=1)
     surgeon_row: Mapped[Number | None] = mapped_column(index=True)
     plan: Mapped[str | None] = mapped_column(Sha256)
-    asked_by: Mapped[str] = mapped_column(default="local")
-    told_at: Mapped[datetime | None]
+    requested_by: Mapped[str] = mapped_column(default="local")
+    submitted_at: Mapped[datetime | None]
     created_at: Mapped[datetime] = mapped_column(default=now)
     started_at: Mapped[datetime | None]
     ended_at: Mapped[datetime | None]
@@ -69,18 +69,11 @@ class Job(Base):
         Index("ix_jobs_kind_row", "kind", "row"),
         Index("ix_jobs_kind_state", "kind", "state", "row"),  # also for the counts at every metrics scrape
         Index("ix_jobs_plan", "plan", "kind", "row"),
-        Index(  # partial, for the retention: the others have not ended
-            "ix_jobs_ended",
-            "ended_at",
-            sqlite_where=text("ended_at IS NOT NULL"),
-            postgresql_where=text("ended_at IS NOT NULL"),
-        ),
-        Index(  # partial, so that failed and cancelled jobs can be requested again
-            "uq_jobs_identity_live",
-            "identity",
-            unique=True,
-            sqlite_where=text("state IN ('queued', 'running', 'succeeded')"),
-            postgresql_where=text("state IN ('queued', 'running', 'succeeded')"),
+        # for the retention: the others have not ended
+        partial_index("ix_jobs_ended", "ended_at", where="ended_at IS NOT NULL"),
+        # so that failed and cancelled jobs can be requested again
+        partial_index(
+            "uq_jobs_identity_live", "identity", where="state IN ('queued', 'running', 'succeeded')", unique=True
         ),
     )
 
@@ -166,7 +159,7 @@ class DatasetChunk(Base):
 class Executor(Base):
     """A worker process and its last heartbeat; an `id` is never reused.
 
-    `found` is the number of faults that its last verification of the history found, which ended at `verified_at`.
+    `faults_found` are those of its last verification of the history, which ended at `verified_at`.
     """
 
     __tablename__ = "executors"
@@ -174,7 +167,7 @@ class Executor(Base):
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     beat_at: Mapped[datetime] = mapped_column(default=now)
     verified_at: Mapped[datetime | None]
-    found: Mapped[int | None]
+    faults_found: Mapped[int | None]
 
 
 class Key(Base):

@@ -33,7 +33,8 @@ from sqlalchemy.pool import ConnectionPoolEntry
 
 from skills.db.disk import POSTGRESQL_FAILED, is_full
 from skills.db.engines import BUSY_TIMEOUT_MS, SPELLING, UNUSABLE, lock_number, open_engine
-from skills.db.history import CHECKPOINTS, HISTORY, History
+from skills.db.history import HISTORY, History
+from skills.db.leaves import CHECKPOINTS
 from skills.db.revisions import refuse_unknown, revision_of, revisions, upgrade
 from skills.db.row_visibility import ONLY, Only
 from skills.db.tiles import fill_tiles
@@ -129,7 +130,7 @@ class Database:
         Raises:
             NotReady: It is not the database that was signed last.
         """
-        kept = self.history.kept_head()
+        kept = self.history.saved_head()
         with self.reading() as session:
             self.history.compare(session.connection(), kept)
 
@@ -157,7 +158,7 @@ class Database:
             before = revision_of(connection)
             refuse_unknown(before)
             if before != revisions()[0] and inspect(connection).has_table(CHECKPOINTS.name):
-                self.history.compare(connection, self.history.kept_head())
+                self.history.compare(connection, self.history.saved_head())
             upgrade(connection)
             self.history.begin(connection)
             if before != revisions()[0]:
@@ -176,10 +177,7 @@ class Database:
         """
         if self.engine.dialect.name != "sqlite":
             return  # PostgreSQL's vacuum does it
-        with (
-            self._errors(),
-            self.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection,
-        ):
+        with self._errors(), self.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def close(self) -> None:

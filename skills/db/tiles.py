@@ -14,8 +14,8 @@ from sqlalchemy import BigInteger, Connection, LargeBinary, Table, func, insert,
 from sqlalchemy.orm import Mapped, mapped_column
 
 from skills.db import Base
-from skills.db.history import CHECKPOINTS, LEAVES
-from skills.transparency import HASH_BYTES, TILE_HEIGHT, TILE_WIDTH, Tiles, leaf_hash, root_of
+from skills.db.leaves import CHECKPOINTS, LEAVES
+from skills.transparency.merkle import HASH_BYTES, TILE_HEIGHT, TILE_WIDTH, Tiles, leaf_hash, root_of
 
 
 class Tile(Base):

@@ -46,7 +46,9 @@ from skills.formats.topics import JOINT_STATE, POSE
 from skills.kinematics import JOINTS, angle_between, forward, instrument_of, joint_margins, matrix_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import joint_ratios
-from skills.transparency import PublicKey, Statement, read_envelope, read_notes
+from skills.transparency.notes import read_notes
+from skills.transparency.signing_keys import PublicKey
+from skills.transparency.statements import Statement, read_envelope
 
 PLAN, VERDICT, POLICY, README = "plan.json", "verdict.json", "policy.json", "README.txt"
 EXECUTOR = "executor.json"  # the timetable

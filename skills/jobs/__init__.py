@@ -3,15 +3,16 @@
 The engine stores its workflows in SQLite or PostgreSQL. The row of a job in our database is authoritative; the engine
 only makes sure that a worker processes it.
 
-    workflows   the workflow of one job: try, retry, give up; and the watch, a worker's periodic tasks: leases and
-                heartbeats, enqueueing, taking over from dead workers, reading back outcomes
-    readiness   checks of the database, the engine and the workers, for health checks; and the warm-up, which compiles
-                or loads the compiled loops before they are needed
+    workflows   the workflow of one job: try, retry, give up; and the engine of a worker, which runs it
+    watch       a worker's periodic tasks: leases and heartbeats, enqueueing, taking over from dead workers, outcomes
+    readiness   checks of the database, the engine and the workers, for health checks
+    warm_up     compiles or loads the compiled loops before they are needed
     worker      the worker process; `skills.serving` starts it as a child of the service
 
-Here is the access to the engine for both sides, and `Engine`, with which the service enqueues jobs. The engine's inputs
-are the row and the attempt of a job, as plain JSON: its tables hold no personal data, and none of their contents is
-ever unpickled. Importing DBOS takes over a second, so it is imported where it is first needed.
+Here is the access to the engine for both sides, and `Engine`, with which the service enqueues jobs. Another engine
+would change this file, `workflows` and `watch`, and nothing else. The engine's inputs are the row and the attempt of a
+job, as plain JSON: its tables hold no personal data, and none of their contents is ever unpickled. Importing DBOS takes
+over a second, so it is imported where it is first needed.
 """
 
 import logging
@@ -24,13 +25,15 @@ from threading import Thread
 from time import time
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import event
+from sqlalchemy import TextClause, event, text
 from sqlalchemy.dialects import plugins
 from sqlalchemy.engine import URL, CreateEnginePlugin, make_url
 from sqlalchemy.engine import Engine as Connections
 
 from skills.db.disk import make_private
 from skills.db.engines import write_ahead
+from skills.db.session import Database
+from skills.errors import NotReady
 from skills.library.operation.jobs import EXPORT, PART, PICTURES
 from skills.settings import Settings
 
@@ -38,22 +41,22 @@ if TYPE_CHECKING:
     from dbos import DBOSClient, DBOSConfig
 
 APPLICATION = "suture-skills"
-# Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and pictures and exports are made ASIDE.
-JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"
+# Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and pictures and exports are of low priority.
+JOBS, BATCHES, LOW_PRIORITY = "jobs", "batches", "low-priority"
 # Concurrent jobs of each queue in a worker process, so that no queue blocks another. The engine stores these limits in
 # its database for all workers, so they are constants, not settings; the load of a machine is set by its number of
 # workers. Two parts of batches: one is learnt while the next one is already there (`library.policies.batches`).
-QUEUES = {JOBS: 2, BATCHES: 2, ASIDE: 1}
+QUEUES = {JOBS: 2, BATCHES: 2, LOW_PRIORITY: 1}
 WORKFLOW = "perform_job"
 STEPS = "1"  # the engine's "application version": change it if and only if the sequence of steps in `workflows` changes
 # Polling interval of each queue. A poll takes 3 ms of processor time, in idle workers too; a part of a batch occupies a
 # worker for a second.
-POLLING_S = {JOBS: 0.3, BATCHES: 0.3, ASIDE: 1.0}
+POLLING_S = {JOBS: 0.3, BATCHES: 0.3, LOW_PRIORITY: 1.0}
 FAREWELL_S = 2.0  # timeout of `Engine.close`, within which it processes its pending calls
 CLOCK = "skills_clock"  # the name of `Clock` in the engine's URL
 
 log = logging.getLogger(__name__)
-Errand = Callable[["DBOSClient"], None]
+Call = Callable[["DBOSClient"], None]
 
 
 def workflow_id(row: int, attempt: int) -> str:
@@ -146,10 +149,10 @@ def _address(settings: Settings) -> str:
 
 def queue_of(kind: str) -> str:
     """Return the name of the queue for jobs of a kind."""
-    return {PART: BATCHES, PICTURES: ASIDE, EXPORT: ASIDE}.get(kind, JOBS)
+    return {PART: BATCHES, PICTURES: LOW_PRIORITY, EXPORT: LOW_PRIORITY}.get(kind, JOBS)
 
 
-def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:
+def submit(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:
     """Enqueue an attempt at a job in the engine; idempotent."""
     client.enqueue(
         {"queue_name": queue_of(kind), "workflow_name": WORKFLOW, "workflow_id": workflow_id(row, attempt)},
@@ -158,9 +161,35 @@ def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:
     )
 
 
-def drop(client: "DBOSClient", row: int, attempt: int) -> None:
+def cancel(client: "DBOSClient", row: int, attempt: int) -> None:
     """Cancel an attempt: it does not start any more, and stops after its current step."""
     client.cancel_workflow(workflow_id(row, attempt))
+
+
+def select_a_workflow(dialect: str) -> TextClause:
+    """Return a query that succeeds where the engine's tables can be read."""
+    table = "workflow_status" if dialect == "sqlite" else "dbos.workflow_status"
+    return text(f"SELECT 1 FROM {table} LIMIT 1")  # noqa: S608 - one of two names of ours
+
+
+def refuse_left_over(settings: Settings) -> None:
+    """Refuse a job engine whose tables belong to another state of the database, for example from before a restore.
+
+    Its workflows refer to jobs by row numbers, which mean other jobs there.
+
+    Raises:
+        NotReady: The engine has such tables, or its database cannot be read.
+    """
+    engine = make_url(settings.engine_url)
+    if engine.get_backend_name() == "sqlite":
+        if engine.database and Path(engine.database).exists():
+            raise NotReady(
+                f"{engine.database} is the job engine's database for another state of this database; move it away."
+            )
+        return
+    with closing(Database(settings.engine_url)) as database, database.reading() as session:
+        if session.scalar(text("SELECT to_regclass('dbos.workflow_status')")) is not None:
+            raise NotReady("The schema `dbos` is the job engine's schema for another state of this database; drop it.")
 
 
 class Engine:
@@ -174,28 +203,28 @@ class Engine:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._client: DBOSClient | None = None
-        self._errands: SimpleQueue[Errand | None] = SimpleQueue()
+        self._calls: SimpleQueue[Call | None] = SimpleQueue()
         self._thread = Thread(target=self._run, name="engine", daemon=True)  # must not delay the exit of the process
         self._thread.start()
 
-    def tell(self, row: int, attempt: int, kind: str) -> None:
+    def submit(self, row: int, attempt: int, kind: str) -> None:
         """Enqueue an attempt at a job; call it after its row is committed."""
-        self._errands.put(lambda client: tell(client, row, attempt, kind))
+        self._calls.put(lambda client: submit(client, row, attempt, kind))
 
     def cancel(self, row: int, attempt: int) -> None:
         """Cancel an attempt of a cancelled job; call it after the cancellation is committed."""
-        self._errands.put(lambda client: drop(client, row, attempt))
+        self._calls.put(lambda client: cancel(client, row, attempt))
 
     def close(self) -> None:
         """Process the pending calls for up to `FAREWELL_S`, then stop."""
-        self._errands.put(None)
+        self._calls.put(None)
         self._thread.join(FAREWELL_S)
 
     def _run(self) -> None:
-        while (errand := self._errands.get()) is not None:
+        while (call := self._calls.get()) is not None:
             try:
                 self._client = self._client or connect(self._settings)
-                errand(self._client)
+                call(self._client)
             except Exception:
                 log.info("The job engine missed a message; the workers' watch will start the job.")
                 log.debug("This is why:", exc_info=True)

@@ -1,48 +1,33 @@
-"""Readiness of an installation: checks of its databases and workers, and the warm-up of the compiled loops.
+"""Readiness of an installation: checks of its databases and workers.
 
 There must be a usable database, the one that was signed last with this signing key, a usable database of the job
 engine, and at least one live worker. Each check uses new connections with a short timeout, so that the result is
-current and arrives in time. After the warm-up, the first job or request does not wait for compilation.
+current and arrives in time.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from datetime import datetime, timedelta
 from pathlib import Path
-from threading import Thread
 
-import numpy as np
-from sqlalchemy import select, text
+from sqlalchemy import select
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
-from skills.compiled import cache_folders, check_cache_folder, make_ready
 from skills.db import now
 from skills.db.models import SutureType
 from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import Executor
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
-from skills.gridworld.grid import GridPath, GridWorld
-from skills.gridworld.reward import sparse_reward
-from skills.learning.certificate import certify
-from skills.learning.evaluation import dtw, measure
-from skills.learning.policy import learn_tabular, rollout_from
-from skills.learning.pose_style import PosePath
-from skills.learning.q_learning import PhaseQLearning
-from skills.learning.tube import certify_tube, next_pose
-from skills.learning.tube_certificate import TubeLimits
-from skills.packing import palette_of
+from skills.jobs import select_a_workflow
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 
 PATIENCE_MS = 2000  # of each connection; a health check must answer soon
 LOOK_S = 0.1  # between two looks at the heartbeats
 UNUSABLE = "The database cannot be read and written; check it, its disk and its server."
-TWO_CELLS = GridPath(GridWorld((0.0, 0.0, 0.0), 1.0, (1, 1, 2)), np.array([0, 1]))
-STILL = np.zeros(2)
-TWO_POSES = PosePath(np.eye(2, 3), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.array([0.0, 1.0]), None, STILL, STILL)
 
 
 def refuse_unready(settings: Settings) -> int:
@@ -61,26 +46,6 @@ def refuse_unready(settings: Settings) -> int:
         database.compare_history()
         _try_engine(settings)
         return _workers(database, settings.lease_s)
-
-
-def refuse_left_over(settings: Settings) -> None:
-    """Refuse a job engine whose tables belong to another state of the database, for example from before a restore.
-
-    Its workflows refer to jobs by row numbers, which mean other jobs there.
-
-    Raises:
-        NotReady: The engine has such tables, or its database cannot be read.
-    """
-    engine = make_url(settings.engine_url)
-    if engine.get_backend_name() == "sqlite":
-        if engine.database and Path(engine.database).exists():
-            raise NotReady(
-                f"{engine.database} is the job engine's database for another state of this database; move it away."
-            )
-        return
-    with closing(Database(settings.engine_url, patience_ms=PATIENCE_MS)) as database, database.reading() as session:
-        if session.scalar(text("SELECT to_regclass('dbos.workflow_status')")) is not None:
-            raise NotReady("The schema `dbos` is the job engine's schema for another state of this database; drop it.")
 
 
 def _refuse_missing(url: str, what: str) -> None:
@@ -110,8 +75,7 @@ def _try_engine(settings: Settings) -> None:
     _refuse_missing(settings.engine_url, "The job engine's database")
     try:
         with closing(Database(settings.engine_url, patience_ms=PATIENCE_MS)) as engine, engine.writing(()) as session:
-            table = "workflow_status" if session.connection().dialect.name == "sqlite" else "dbos.workflow_status"
-            session.execute(text(f"SELECT 1 FROM {table} LIMIT 1"))  # noqa: S608 - one of two names of ours
+            session.execute(select_a_workflow(session.connection().dialect.name))
     except (SkillsError, SQLAlchemyError) as error:
         raise NotReady("The job engine's database cannot be used; check it, and start a worker.") from error
 
@@ -139,52 +103,3 @@ def _beats(database: Database) -> Mapping[str, datetime]:
             return {one.id: one.beat_at for one in session.execute(select(Executor.id, Executor.beat_at))}
     except (SkillsError, SQLAlchemyError) as error:
         raise NotReady("The database cannot be read; check it, its disk and its server.") from error
-
-
-# ---- warm-up of the compiled loops ---------------------------------------------------------------------------------
-
-
-def warm_up(work: Callable[[], object]) -> Thread:
-    """Run `work` once in a background thread, so that the functions it calls are compiled or loaded.
-
-    The reader's loops are prepared in the process that runs them, the fork server (`skills.formats.reader_process`);
-    their cache folder is checked here too, so that a process which would refuse it later does not start.
-
-    Args:
-        work: Callback that calls the compiled loops with small inputs.
-
-    Returns:
-        The thread.
-
-    Raises:
-        BadSettings: Machine code would be loaded from a folder that other users can write to; see `check_cache_folder`.
-    """
-    for folder in cache_folders():
-        check_cache_folder(folder)
-    # Not a daemon thread: the interpreter's shutdown must not kill it while it compiles.
-    warming = Thread(target=make_ready, args=(work,), name="warm-up")
-    warming.start()
-    return warming
-
-
-def learn_once() -> None:
-    """Learn a policy of the shortest possible path.
-
-    A job calls the same functions.
-    """
-    policy = learn_tabular(sparse_reward(TWO_CELLS), PhaseQLearning())
-    certify(policy)
-    measure(rollout_from(policy, TWO_CELLS.start))
-    palette_of(policy.q)
-    certify_tube(TWO_POSES, TubeLimits())
-    align_once()
-
-
-def align_once() -> None:
-    """Align the shortest possible path with its reverse, compute a palette, and follow two poses.
-
-    A request calls the same functions.
-    """
-    dtw(TWO_CELLS.tip_mm, TWO_CELLS.tip_mm[::-1])
-    palette_of(TWO_CELLS.tip_mm)
-    next_pose(TWO_POSES, TWO_POSES.tip_mm[0], TWO_POSES.rotation_xyzw[0], None, TubeLimits())

@@ -16,13 +16,11 @@ import signal
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from itertools import cycle
 from threading import Event, Thread
 from types import FrameType
 
-from dbos import DBOS
 from sqlalchemy import select
 
 from skills import logs
@@ -30,8 +28,9 @@ from skills.db.revisions import refuse_other_tables
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import SkillsError
-from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
-from skills.jobs.workflows import Leases, Perform, Watch, Work, register
+from skills.jobs import BATCHES, JOBS, connect
+from skills.jobs.watch import Leases, Watch
+from skills.jobs.workflows import Perform, Work, engine_of, recover_workflows
 from skills.library.operation.sweep import SteadyClock, sweep
 from skills.logs import job_id, log_fields
 from skills.sandbox.forked import refuse_uncontained
@@ -119,16 +118,16 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
         refuse_other_tables(session.connection())
     client = connect(settings)
     work = Work(database, settings, perform)
-    leases, recover, clock = Leases(settings.lease_s), DBOS._recover_pending_workflows, SteadyClock()
+    leases, clock = Leases(settings.lease_s), SteadyClock()
 
     def sweeping() -> bool:
         return sweep(database, settings, SWEEPING_S, by_age=clock.is_steady())
 
-    watch = Watch(database, client, executor, leases, recover, work.doing, sweeping)
+    watch = Watch(database, client, executor, leases, recover_workflows, work.doing, sweeping)
     try:
         watch.beat()  # registered before it can hold any job, so that others can take over
         Thread(target=_keep_verified, args=(watch, settings.verify_every_s), daemon=True, name="verify").start()
-        with _engine(work, executor, watch):
+        with engine_of(work, executor, lambda: _patience_s(watch), lambda: _survive(watch.beat)):
             gc.freeze()  # everything imported so far stays, so later collections skip it
             gc.enable()  # the callers disable it while they import
             _go_round(watch, lambda: stop.wait(ROUND_S) or _orphaned(parent))
@@ -174,36 +173,18 @@ def _keep_verified(watch: Watch, every_s: float) -> None:
 
 def _library() -> Perform:
     """Return the library's `perform_job`, and start the warm-up for it."""
-    from skills.jobs.readiness import learn_once, warm_up  # imported late, because they import everything else
+    from skills.jobs.warm_up import learn_once, warm_up
     from skills.library.perform import perform_job
 
     warm_up(learn_once)
     return perform_job
 
 
-@contextmanager
-def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
-    """Run the engine for the duration of the block, then drain it: running jobs may finish, new ones are not taken."""
-    register(work)
-    DBOS(config=configuration(work.settings, executor))
-    DBOS.launch()
-    for queue, at_once in QUEUES.items():
-        DBOS.register_queue(queue, worker_concurrency=at_once, polling_interval_sec=POLLING_S[queue])
-    try:
-        yield
-    finally:
-        drain = Thread(target=DBOS.destroy, kwargs={"workflow_completion_timeout_sec": _patience_s(watch)})
-        drain.start()
-        while drain.is_alive():  # without heartbeats others would take over the jobs that are being finished
-            _survive(watch.beat)
-            drain.join(ROUND_S)
-
-
 def _patience_s(watch: Watch) -> int:
     """Return the timeout of draining in seconds.
 
-    It is 0 unless jobs of the queues `JOBS` or `BATCHES` run: those of `ASIDE` may take long, nobody waits for them,
-    and they are run again.
+    It is 0 unless jobs of the queues `JOBS` or `BATCHES` run: those of `LOW_PRIORITY` may take long, no user waits for
+    them, and they are run again.
     """
     return DRAIN_S if _at_work(watch, JOBS, BATCHES) else 0
 

@@ -1,40 +1,33 @@
-"""The workflow of one job, and the watch of each worker over all of them.
+"""The workflow of one job: try, pause, retry, give up.
 
-A workflow tries, pauses, retries, and finally gives up. Each try is a step of the engine, so finished tries are not
-repeated when another worker takes over. No exception reaches the engine, which would store its text; the outcome is
-stored in our row, and each update of that row names the attempt and the states that it may replace.
-
-The engine does not take over from a dead worker, does not know jobs that were never enqueued in it, and does not write
-the outcome of a workflow into our rows. A round of the watch does all three, with leases and heartbeats. Every worker
-runs such rounds, so each change is one conditional, idempotent statement, and any worker may make it.
+Each try is a step of the engine, so finished tries are not repeated when another worker takes over. No exception
+reaches the engine, which would store its text; the outcome is stored in our row, and each update of that row names the
+attempt and the states that it may replace.
 """
 
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import timedelta
-from math import inf
+from threading import Thread
 
-from dbos import DBOS, DBOSClient, WorkflowStatus
-from sqlalchemy import delete, func, select, update
+from dbos import DBOS
+from sqlalchemy import func, update
 
 from skills.db import now
-from skills.db.service_tables import LONGEST_REASON, Executor, Job
+from skills.db.service_tables import LONGEST_REASON, Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
-from skills.jobs import JOBS, QUEUES, STEPS, WORKFLOW, drop, tell, workflow_id
+from skills.jobs import POLLING_S, QUEUES, WORKFLOW, configuration, workflow_id
 from skills.library.operation import locks
-from skills.library.operation.history import NAMED, Verified, keep_signed, verify_history
-from skills.library.operation.jobs import ACTIVE, BATCH, PART, UNSYNCHRONISED, end_part, names_of
+from skills.library.operation.jobs import ACTIVE, PART, end_part, names_of
 from skills.settings import Settings
 
 FIRST_PAUSE_S = 0.2
-
+BEAT_S = 0.5  # between two heartbeats while the engine is drained
 log = logging.getLogger(__name__)
 Perform = Callable[[Database, int, int, Settings], None]
-LONGEST_LOOK_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -145,293 +138,34 @@ def register(work: Work) -> None:
                 give_up(row, attempt)
 
 
-# ---- the watch -----------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Leases:
-    """The time since the last heartbeat of each worker, as measured by one observer.
-
-    A heartbeat is only compared with the one seen before; its date is never compared with a clock. Time is that of this
-    process's monotonic clock, and each look adds at most `LONGEST_LOOK_S`. So a wall clock that jumps by an hour has no
-    effect, on one machine or several; nor has a pause of the observer, of the machine, or of the database, after which
-    all heartbeats are old. The cost: a worker that has just started waits for a full lease before it takes over from
-    others.
-    """
-
-    lease_s: float
-    clock: Callable[[], float] = time.monotonic
-    _looked_s: float | None = None
-    _seen: dict[str, object] = field(default_factory=dict)
-    _silent_s: dict[str, float] = field(default_factory=dict)
-
-    def look(self, beats: Mapping[str, object]) -> Mapping[str, float]:
-        """Compare the heartbeats with those of the last look, and return the seconds since the last change of each.
-
-        Args:
-            beats: The last heartbeat by executor; None for an executor that holds work but has no heartbeat.
-
-        Returns:
-            Seconds by executor; 0 where the heartbeat has changed or was not seen before.
-        """
-        now_s = self.clock()
-        passed_s = 0.0 if self._looked_s is None else min(now_s - self._looked_s, LONGEST_LOOK_S)
-        self._looked_s = now_s
-        self._silent_s = {
-            executor: self._silent_s[executor] + passed_s if self._unchanged(executor, beat) else 0.0
-            for executor, beat in beats.items()
-        }
-        self._seen = dict(beats)
-        return self._silent_s
-
-    def dead(self) -> set[str]:
-        """Return the executors whose lease has expired."""
-        return {executor for executor, silent_s in self._silent_s.items() if silent_s > self.lease_s}
-
-    def _unchanged(self, executor: str, beat: object) -> bool:
-        return executor in self._seen and self._seen[executor] == beat
-
-
-AT_ONCE = 100  # jobs compared in a round: a round must stay much shorter than a lease
-FORGOTTEN_AFTER_LEASES = 30
-SWEEP_S = 60.0  # between two sweeps, if nothing was left by the first
-ENGINE_DAYS = 7  # ours: the engine's rows of ended workflows are kept as long, for whoever looks into a failure
-ENGINE_ATTEMPTS = 10  # of one job: an engine that has failed that often will fail again
-
-# Statuses of a workflow that ended without a result in our row, with the state and the reason for the row.
-ENDINGS = {
-    "CANCELLED": ("cancelled", "It was cancelled in the job engine."),
-    "MAX_RECOVERY_ATTEMPTS_EXCEEDED": (
-        "failed",
-        "The worker died at each attempt at this job; check the worker's log, then request it again.",
-    ),
-}
-# `workflows.perform_job` raises nothing itself. If a workflow ends with an error, or without an outcome in our row, the
-# engine's database or ours was unavailable. The job did not fail, so a new attempt is started.
-ENGINE_FAILED = ("ERROR", "SUCCESS")
-
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Live:
-    """A job that has not ended."""
-
-    row: int
-    attempt: int
-    told: bool
-    kind: str
-
-    @property
-    def workflow(self) -> str:
-        """The id of its workflow."""
-        return workflow_id(self.row, self.attempt)
+def recover_workflows(executors: list[str]) -> None:
+    """Return the pending workflows of dead executors to their queues, if they are still theirs."""
+    DBOS._recover_pending_workflows(executors)
 
 
-class Watch:
-    """The periodic rounds of one worker."""
+@contextmanager
+def engine_of(work: Work, executor: str, patience_s: Callable[[], int], beat: Callable[[], object]) -> Iterator[None]:
+    """Run the engine for the duration of the block, then drain it: running jobs may finish, new ones are not taken.
 
-    def __init__(
-        self,
-        database: Database,
-        client: DBOSClient,
-        executor: str,
-        leases: Leases,
-        recover: Callable[[list[str]], object],
-        doing: Collection[str] = frozenset(),
-        sweep: Callable[[], bool] = lambda: True,
-    ) -> None:
-        """Create the watch of one executor.
-
-        Args:
-            database: Our database.
-            client: Client of the engine.
-            executor: Id of this worker in the engine and in our table of executors.
-            leases: Leases of the other workers.
-            recover: Callback that returns the pending workflows of dead executors to their queue, provided that they
-                are still pending and still assigned to those executors.
-            doing: Ids of the workflows that this worker is running; a live view, not a copy.
-            sweep: Deletes what nobody needs any more in our database for a moment; returns whether nothing is left.
-        """
-        self._database = database
-        self._client = client
-        self._executor = executor
-        self._leases = leases
-        self._recover = recover
-        self._doing = doing
-        self._sweep = sweep
-        self._swept_s: float | None = None
-        self._unheard = Leases(leases.lease_s, leases.clock)
-
-    def beat(self) -> None:
-        """Write a heartbeat."""
-        with self._database.writing(()) as session:
-            mine = update(Executor).where(Executor.id == self._executor).values(beat_at=now()).returning(Executor.id)
-            if session.execute(mine).first() is None:  # the first heartbeat, or others have deleted our row
-                session.add(Executor(id=self._executor))
-
-    def round(self) -> None:
-        """Write a heartbeat, sign the history, take over from dead workers, enqueue new jobs, read back outcomes."""
-        self.beat()
-        if not keep_signed(self._database):
-            return  # of another database than was signed last nothing is done
-        self._take_over()
-        live = self._live()
-        known = {w.workflow_id: w for w in self._workflows(live)}
-        for job in live:
-            workflow = known.get(job.workflow)
-            if workflow is None:
-                tell(self._client, job.row, job.attempt, job.kind)
-            elif workflow.status in ENDINGS:
-                state, reason = ENDINGS[workflow.status]
-                fail(self._database, job.row, job.attempt, reason, state)
-            elif workflow.status in ENGINE_FAILED:
-                self._begin_again(job)
-        self._remember_told([job.row for job in live if not job.told])
-        if self._swept_s is None or time.monotonic() - self._swept_s > SWEEP_S:
-            self._forget_ended()
-            if self._sweep():
-                self._swept_s = time.monotonic()
-
-    def verify(self) -> None:
-        """Verify the history and all logged rows, if this is the first of the workers; log and count the faults."""
-        with self._database.reading() as session:
-            first = session.scalar(select(func.min(Executor.id)))
-        if first != self._executor or self._database.history.refused is not None:
-            return
-        with self._database.reading() as session:
-            found = list(verify_history(session.connection(), self._database.history, None, Verified()))
-        for name, why in found[:NAMED]:
-            log.error("The history is not whole: %s: %s; run `skills verify`.", name, why)
-        with self._database.writing(()) as session:
-            mine = update(Executor).where(Executor.id == self._executor)
-            session.execute(mine.values(verified_at=now(), found=len(found)))
-
-    def leave(self) -> None:
-        """Sign the last leaves of the history, and remove this worker from the table of executors."""
-        keep_signed(self._database, inf)
-        with self._database.writing(()) as session:
-            session.execute(delete(Executor).where(Executor.id == self._executor))
-
-    def at_work(self, *queues: str) -> bool:
-        """Return whether this worker still holds workflows of some queues, by default of any."""
-        return bool(self._pending(self._executor, queues or QUEUES))
-
-    def _take_over(self) -> None:
-        """Return the workflows of dead workers to their queues, and forget workers that have been silent for long.
-
-        The engine's own `resume_workflow` is not used: it would run cancelled work, would take work that a third worker
-        has just taken over, and would reset the count of workers that the work has killed.
-        """
-        pending = self._pending()
-        self._give_back({workflow.workflow_id for workflow in pending if workflow.executor_id == self._executor})
-        holders = {workflow.executor_id for workflow in pending if workflow.executor_id}
-        with self._database.reading() as session:
-            beats = {row.id: row.beat_at for row in session.execute(select(Executor.id, Executor.beat_at))}
-        others = {**dict.fromkeys(holders), **beats}
-        others.pop(self._executor, None)
-        silent_s = self._leases.look(others)
-        if dead := sorted(self._leases.dead()):
-            self._inherit(dead)
-        for executor in others.keys() - holders:
-            if silent_s[executor] > FORGOTTEN_AFTER_LEASES * self._leases.lease_s:
-                self._forget(executor, beats[executor])
-
-    def _forget_ended(self) -> None:
-        """Delete some of the engine's rows of workflows that ended long ago; the outcomes are in our rows."""
-        before = (now() - timedelta(days=ENGINE_DAYS)).isoformat()
-        ended = self._client.list_workflows(
-            status=["SUCCESS", *ENDINGS, "ERROR"], end_time=before, limit=AT_ONCE, load_input=False, load_output=False
-        )
-        if ended:
-            self._client.delete_workflows([one.workflow_id for one in ended])
-
-    def _give_back(self, mine: set[str]) -> None:
-        """Return workflows to the queue that are assigned to this worker but have not been started for a full lease.
-
-        That happens when the connection breaks between a commit and its response: the worker never learns of the
-        assignment.
-        """
-        self._unheard.look(dict.fromkeys(mine.difference(self._doing)))
-        for workflow in self._unheard.dead():
-            log.warning("Job %s was claimed and never started; it is queued again.", workflow)
-            self._client._sys_db.reenqueue_for_recovery(workflow, [self._executor], JOBS)
-
-    def _inherit(self, dead: list[str]) -> None:
-        """Return the workflows of dead workers to their queues.
-
-        A workflow of another version of the steps, which only workers of that version could resume, is started again as
-        a new attempt.
-        """
-        left = self._client.list_workflows(  # without inputs and outputs, which are not needed here
-            status=["PENDING", "ENQUEUED"],
-            executor_id=dead,
-            queue_name=list(QUEUES),
-            load_input=False,
-            load_output=False,
-        )
-        for workflow in left:
-            if workflow.app_version != STEPS:
-                self._start_over(workflow.workflow_id)
-        ours = {w.executor_id for w in left if w.app_version == STEPS and w.status == "PENDING" and w.executor_id}
-        if ours:
-            log.warning("Taking over from %s, silent for longer than its lease.", ", ".join(sorted(ours)))
-            self._recover(sorted(ours))
-
-    def _forget(self, executor: str, beat_at: object) -> None:
-        with self._database.writing(()) as session:
-            session.execute(delete(Executor).where(Executor.id == executor, Executor.beat_at == beat_at))
-
-    def _live(self) -> list[Live]:
-        """Return jobs that have not ended: those never enqueued first, then the oldest.
-
-        Batches themselves are left out, because the engine runs only their parts.
-        """
-        query = select(Job.row, Job.attempt, Job.told_at.is_not(None), Job.kind).where(Job.state.in_(ACTIVE))
-        query = query.where(Job.kind != BATCH)
-        with self._database.reading() as session:
-            rows = session.execute(query.order_by(Job.told_at.is_not(None), Job.row).limit(AT_ONCE)).all()
-        return [Live(*row) for row in rows]
-
-    def _workflows(self, live: Sequence[Live]) -> list[WorkflowStatus]:
-        if not live:
-            return []
-        names = [job.workflow for job in live]
-        return self._client.list_workflows(workflow_ids=names, load_input=False, load_output=False)
-
-    def _pending(self, executor: str | None = None, queues: Iterable[str] = QUEUES) -> list[WorkflowStatus]:
-        return self._client.list_workflows(
-            status="PENDING", queue_name=list(queues), executor_id=executor, load_input=False, load_output=False
-        )
-
-    def _start_over(self, workflow: str) -> None:
-        """Start a new attempt at a job whose current attempt cannot be resumed.
-
-        It is enqueued in this round or the next; after a crash in between, the old attempt finds that it is no longer
-        current.
-        """
-        row, attempt = map(int, workflow.split("-"))
-        again = {"state": "queued", "attempt": attempt + 1, "told_at": None}
-        with self._database.writing([locks.job(row)]) as session:
-            mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
-            session.execute(update(Job).where(*mine).values(**again))
-        drop(self._client, row, attempt)
-
-    def _begin_again(self, job: Live) -> None:
-        """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`."""
-        if job.attempt < ENGINE_ATTEMPTS:
-            log.warning("The job engine failed in job %d at attempt %d; it is started again.", job.row, job.attempt)
-            self._start_over(job.workflow)
-        else:
-            reason = (
-                f"The job engine failed {job.attempt} times in this job; check the worker's log, then request it again."
-            )
-            fail(self._database, job.row, job.attempt, reason)
-
-    def _remember_told(self, rows: Sequence[int]) -> None:
-        if rows:
-            # Rows that another transaction changes now are left for the next round: waiting for several rows in an
-            # order of its own could deadlock.
-            untold = select(Job.row).where(Job.row.in_(rows), Job.told_at.is_(None)).with_for_update(skip_locked=True)
-            with self._database.writing(()) as session:
-                session.execute(update(Job).where(Job.row.in_(untold)).values(told_at=now()), **UNSYNCHRONISED)
+    Args:
+        work: What performs the jobs.
+        executor: The id of this worker in the engine.
+        patience_s: Returns the timeout of draining in seconds.
+        beat: Writes a heartbeat; without it others would take over the jobs that are being finished.
+    """
+    register(work)
+    DBOS(config=configuration(work.settings, executor))
+    DBOS.launch()
+    for queue, at_once in QUEUES.items():
+        DBOS.register_queue(queue, worker_concurrency=at_once, polling_interval_sec=POLLING_S[queue])
+    try:
+        yield
+    finally:
+        drain = Thread(target=DBOS.destroy, kwargs={"workflow_completion_timeout_sec": patience_s()})
+        drain.start()
+        while drain.is_alive():
+            beat()
+            drain.join(BEAT_S)

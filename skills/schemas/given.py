@@ -49,24 +49,6 @@ class SignedCheckpoint(Given):
     verifier: str = Field(description="The public key of the note: its name, number and Ed25519 key.")
 
 
-class EnvelopeSignature(Given):
-    """A signature in an envelope."""
-
-    keyid: str = Field(description="The number of the key, as in `verifier` of `GET /history/checkpoint`.")
-    sig: str = Field(description="Ed25519 over the payload as DSSE encodes it, in base64.")
-
-
-class SignedEnvelope(Given):
-    """A DSSE envelope with an in-toto Statement: the SHA-256 of files, and what they are, signed by this service.
-
-    The bytes of each file are those of the call that gives it; a file of other bytes is not covered.
-    """
-
-    payloadType: Literal["application/vnd.in-toto+json"]  # noqa: N815 - the name in DSSE
-    payload: str = Field(description="The statement as JSON, in base64.")
-    signatures: list[EnvelopeSignature]
-
-
 class LeafProof(Given):
     """The proof that a row was logged as it is disclosed.
 

@@ -8,6 +8,8 @@ from pydantic import Field
 from skills.fields import Fraction
 from skills.schemas import Given, PolicyName
 
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+
 
 class ServedNow(PolicyName):
     """The policy version that a style serves."""
@@ -20,7 +22,7 @@ class Job(Given):
 
     id: str = Field(pattern="^[0-9a-f]{16}$")
     kind: str = Field(description="training, retraining, playback, pictures, dataset or try.")
-    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    state: JobState
     progress: Fraction
     request: dict[str, Any] = Field(description="What was asked for, all defaults resolved.")
     result: dict[str, Any] | None = Field(

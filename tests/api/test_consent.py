@@ -9,7 +9,7 @@ import httpx2 as httpx
 import pytest
 
 from skills.api.authentication import REMEMBERED_S
-from skills.api.responses import NPZ
+from skills.api.encoded_policies import NPZ
 from skills.library.people import consent
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key

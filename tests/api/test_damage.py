@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from skills.db.changes import WeightedCache
+from skills.db.weighted_cache import WeightedCache
 from skills.library.operation import integrity
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases

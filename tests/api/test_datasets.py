@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from skills.api import responses
+from skills.api import streams
 from skills.client import Problem
 from skills.errors import BadInput, Conflict
 from skills.formats.bag_writer import write_mcap
@@ -125,7 +125,7 @@ def test_consent_withdrawn_during_a_download_cuts_it_off(service: Service, monke
         return datasets.dataset_chunk(service.database, dataset, number)
 
     async def download() -> None:
-        async for piece in responses.stored_pieces(chunk, lambda: None, dataset, service.app.state.downloads):
+        async for piece in streams.stored_pieces(chunk, lambda: None, dataset, service.app.state.downloads):
             sent.append(piece)  # noqa: PERF401 - those that were sent before the error count
 
     with pytest.raises(Conflict, match="does not cover export"):

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 
-from skills.api.authentication import COOKIE
+from skills.api.gate import COOKIE
 from skills.db import now, rfc3339
-from skills.jobs.workflows import Leases, Watch
+from skills.jobs.watch import Leases, Watch
 from skills.library.operation.history import sign_history
 from skills.library.people.keys import digest_of
 from tests import backends

@@ -35,7 +35,7 @@ def full_file(**_how: object) -> IO[bytes]:
 
 def test_a_full_disk_for_temporary_files_is_507(service: Service, caplog: pytest.LogCaptureFixture, monkeypatch):
     monkeypatch.setattr(logging.getLogger("skills.api"), "disabled", False)
-    monkeypatch.setattr("skills.api.dependencies.tempfile.SpooledTemporaryFile", full_file)
+    monkeypatch.setattr("skills.api.uploads.tempfile.SpooledTemporaryFile", full_file)
     answer = service.http.post("/demos", params=KESTREL, content=cases.hand_off(), headers={"Content-Type": CSV})
     assert_problem(answer, 507, "storage-full")
     assert "No space left on device" in caplog.text
@@ -51,9 +51,7 @@ def test_a_full_disk_for_temporary_files_is_507(service: Service, caplog: pytest
         (errno.EDQUOT, 507, "storage-full"),
     ],
 )
-@pytest.mark.parametrize(
-    "place", ["skills.api.dependencies.tempfile.SpooledTemporaryFile", "skills.sandbox.forked._ask"]
-)
+@pytest.mark.parametrize("place", ["skills.api.uploads.tempfile.SpooledTemporaryFile", "skills.sandbox.forked._ask"])
 def test_what_the_system_refuses_for_now_is_no_internal_error(
     service: Service, place: str, number: int, status: int, kind: str, caplog: pytest.LogCaptureFixture, monkeypatch
 ):

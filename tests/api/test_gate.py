@@ -15,7 +15,8 @@ import pytest
 from sqlalchemy import event, text
 
 from skills.api.app import ALWAYS
-from skills.api.authentication import BAD_AT_ONCE, COOKIE, PROXY_SECRET, Bucket, Gate
+from skills.api.gate import COOKIE, PROXY_SECRET, Gate
+from skills.api.rate_limits import BAD_AT_ONCE, Bucket
 from skills.library.people.keys import revoke_key
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key, routes
@@ -41,9 +42,7 @@ def remember_nothing(service: Service) -> None:
 # ---- keys
 
 
-def test_local_requests_need_a_key_once_the_first_key_was_made(
-    service: Service,
-):
+def test_local_requests_need_a_key_once_the_first_key_was_made(service: Service):
     assert service.http.put("/surgeons/kestrel", json={}).status_code == 201
     text = key(service, "anna", "reader")
     assert_problem(service.http.get("/surgeons"), 401, "not-signed-in")

@@ -17,7 +17,8 @@ from skills.db import now
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import NotReady
-from skills.jobs.readiness import refuse_left_over, refuse_unready
+from skills.jobs import refuse_left_over
+from skills.jobs.readiness import refuse_unready
 from skills.sandbox.containment import LAYERS
 from skills.sandbox.forked import layers_held
 from skills.serving import _load

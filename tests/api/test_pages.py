@@ -11,12 +11,15 @@ import pytest
 from sqlalchemy import select
 from starlette.testclient import TestClient
 
-from skills.api.pages import BORROWED, assets, build, number, share, size
+from skills.api.pages.assets import BORROWED, assets, build
+from skills.api.pages.filters import number, share, size
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
 from skills.db.service_tables import Job
 from skills.learning.policy import rollout_from
 from skills.library.operation.integrity import covered, learnt
-from skills.library.operation.overview import MOST, matrix, moves_to_goal
+from skills.library.operation.overview import MOST
+from skills.library.operation.styles import matrix
+from skills.library.operation.views import moves_to_goal
 from skills.library.people.consent import may
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.versions import find_version

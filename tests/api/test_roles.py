@@ -7,8 +7,8 @@ import pytest
 from fastapi import APIRouter
 from sqlalchemy import update
 
-from skills.api.authentication import is_open
 from skills.api.authorisation import Needs
+from skills.api.gate import is_open
 from skills.db import now
 from skills.db.service_tables import Key
 from skills.library.people.keys import LADDER, revoke_key
@@ -78,8 +78,8 @@ def path_of(path: str) -> str:
 
 @pytest.fixture
 def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    monkeypatch.setattr("skills.api.authentication.BAD_AT_ONCE", 10**6)
-    monkeypatch.setattr("skills.api.authentication.BAD_OF_ALL_AT_ONCE", 10**6)
+    monkeypatch.setattr("skills.api.rate_limits.BAD_AT_ONCE", 10**6)
+    monkeypatch.setattr("skills.api.rate_limits.BAD_OF_ALL_AT_ONCE", 10**6)
     with serving(backends.fresh("sqlite", tmp_path), key_requests_per_s=1e6) as service:
         yield service
 

@@ -8,17 +8,19 @@ import pytest
 from sqlalchemy import select, text
 
 from skills.api import policy_cache
-from skills.db.history import CHECKPOINTS
+from skills.db.leaves import CHECKPOINTS
 from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.errors import Conflict, NotReady
-from skills.library.operation.backup import accept_rollback, back_up, erasures_of, restore
-from skills.library.operation.history import Verified, keep_signed, sign_history, verify_history
+from skills.library.operation.backup import accept_rollback, back_up, restore
+from skills.library.operation.erasure_list import erasures_of
+from skills.library.operation.history import Verified, sign_history, sign_some_history, verify_history
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
-from skills.transparency import SigningKey, read_notes
+from skills.transparency.notes import read_notes
+from skills.transparency.signing_keys import SigningKey
 from tests import backends
 from tests.api.service import POLICY, Service, assert_problem, serving
 from tests.library import cases
@@ -84,7 +86,7 @@ def test_an_older_copy_that_was_put_back_is_not_served(url: str, caplog: pytest.
     with serving(url) as service:
         assert_closed(service, OLDER)
         assert "skills accept-rollback" in service.http.get(POLICY).json()["detail"]
-        assert not keep_signed(service.database)
+        assert not sign_some_history(service.database)
     assert heads_of(url) == kept  # no fork is appended
     assert OLDER in caplog.text
     put_back(right, url)

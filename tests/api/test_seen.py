@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from skills.api.authentication import is_open
+from skills.api.gate import is_open
 from skills.db import Base
-from skills.db.row_visibility import OF_NOBODY, Only
+from skills.db.row_visibility import UNRESTRICTED_TABLES, Only
 from skills.db.service_tables import Job
-from skills.library.operation.jobs import to_tell
+from skills.library.operation.jobs import attempts_to_submit
 from skills.library.people.keys import held, list_keys
 from tests.api.keyed import HERON, As, copy_of_told, key, routes
 from tests.api.service import CSV, GOAL_MM, KESTREL, Service, serving
@@ -150,7 +150,9 @@ def test_a_batch_for_all_is_one_for_the_surgeons_of_the_key(service: Service, ad
     with service.database.seen_by(held_by(service, "of heron")).reading() as session:
         found = session.scalar(select(Job).where(Job.id == job))
         assert found is not None
-        assert len(to_tell(session, found)) == 1  # its parts are visible too, otherwise the engine would never get them
+        assert (
+            len(attempts_to_submit(session, found)) == 1
+        )  # its parts are visible too, otherwise the engine would never get them
     assert heron("DELETE", f"/jobs/{job}").json()["state"] == "cancelled"
     assert admin("DELETE", f"/jobs/{everybodys}").json()["state"] == "cancelled"
 
@@ -227,5 +229,5 @@ def test_an_erased_surgeon_is_as_unknown_to_a_restricted_key_as_nobody(tmp_path:
 
 def test_every_table_has_a_rule_or_is_said_to_need_none():
     ruled = {table.__tablename__ for table in Only("somebody", frozenset({1})).rules}
-    assert ruled | set(OF_NOBODY) == set(Base.metadata.tables)
-    assert not ruled & set(OF_NOBODY)
+    assert ruled | set(UNRESTRICTED_TABLES) == set(Base.metadata.tables)
+    assert not ruled & set(UNRESTRICTED_TABLES)

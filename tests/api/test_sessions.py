@@ -55,7 +55,7 @@ def posed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service]:
     url = of_pose_style(request.param, tmp_path)
     with serving(url, key_sessions=2) as service:
         yield service
-        until(lambda: service.app.state.sessions.count == 0)
+        until(lambda: service.app.state.sessions.places.count == 0)
     backends.drop(url)
 
 
@@ -121,7 +121,7 @@ def test_a_session_has_the_other_arm_as_next_does(backend: str, tmp_path: Path):
                 hand, phase = {name: answer[name] for name in hand}, answer["phase"]
                 other = {"arm": "PSM1", **{name: there[name][phase] for name in (*hand, "jaw_rad")}}
                 assert answer["partner_pose"] == asked["partner_pose"] == other
-        until(lambda: service.app.state.sessions.count == 0)
+        until(lambda: service.app.state.sessions.places.count == 0)
     backends.drop(url)
 
 
@@ -243,10 +243,7 @@ def test_who_may_not_open_one_is_refused_before_it_opens(posed: Service):
         ({"Authorization": f"Bearer {key}", "Origin": "http://elsewhere.org"}, 403),
         ({"Authorization": f"Bearer {key}", "Host": "elsewhere.org"}, 400),
     ):
-        with (
-            pytest.raises(WebSocketDenialResponse) as refused,
-            posed.http.websocket_connect(SESSION, headers=headers),
-        ):
+        with pytest.raises(WebSocketDenialResponse) as refused, posed.http.websocket_connect(SESSION, headers=headers):
             pass
         denied(refused.value, status)
     with opened(posed, key), opened(posed, key):

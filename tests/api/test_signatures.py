@@ -9,7 +9,7 @@ from skills.errors import Busy
 from skills.library.operation import proofs
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.schemas.people import SurgeonIn
-from skills.transparency import SigningKey
+from skills.transparency.signing_keys import SigningKey
 from tests.api.service import KESTREL, POLICY, Service, assert_problem
 from tests.independent_history import check_envelope, root_in
 

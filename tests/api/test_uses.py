@@ -12,7 +12,7 @@ from starlette.testclient import WebSocketDenialResponse
 
 from skills.db import now, rfc3339
 from skills.formats import write_mcap
-from skills.library.operation.history import keep_signed
+from skills.library.operation.history import sign_some_history
 from tests.api.keyed import copy_of_told, routes
 from tests.api.service import GOAL_MM, KESTREL, MCAP, Service, serving
 from tests.library import cases, exports
@@ -177,7 +177,7 @@ def test_without_any_use_each_operation_answers_as_the_table_says(service: Servi
                 getattr(said, "text", said),
             )
     service.client.put_surgeon("kestrel", skill_level="expert", consent=NO_USE)
-    keep_signed(service.database)
+    sign_some_history(service.database)
     wrong = {}
     for row in WALKED:
         said = ask(service, row, ids)

@@ -34,7 +34,7 @@ from skills.jobs import Engine
 from skills.learning.certificate import Certificate, Coverage, certify
 from skills.learning.policy import LEARNER_VERSION, describe_learner, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.library.operation.jobs import PART, to_tell
+from skills.library.operation.jobs import PART, attempts_to_submit
 from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies.retraining import request_retraining
@@ -216,9 +216,9 @@ def asked(database: Database, engine: Engine, **what: object) -> int:
     """Request a batch as the service does."""
     job, *_ = request_retraining(database, RetrainingIn(**what), "bench")
     with database.reading() as session:
-        told = to_tell(session, job)
+        told = attempts_to_submit(session, job)
     for row, attempt in told:
-        engine.tell(row, attempt, PART)
+        engine.submit(row, attempt, PART)
     return job.row
 
 

@@ -14,14 +14,15 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 from starlette.testclient import TestClient
 
-from skills.api.responses import JSON, NPZ, Encoded
+from skills.api.encoded_policies import NPZ, Encoded
+from skills.api.responses import JSON
 from skills.db.models import Demonstration
 from skills.db.service_tables import Job
 from skills.db.session import Database
-from skills.jobs.workflows import Leases, Watch
+from skills.jobs.watch import Leases, Watch
 from skills.library.operation import jobs
+from skills.library.operation.installation import condition_of, count_jobs
 from skills.library.operation.jobs import BATCH
-from skills.library.operation.overview import condition_of, count_jobs
 from skills.library.people import catalogue
 from skills.library.policies import versions
 from skills.library.policies.retraining import choose_styles, list_styles

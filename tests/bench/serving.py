@@ -63,7 +63,7 @@ def serving(table: Table, rounds: int = ROUNDS) -> None:
                 beside_constants(table, asked, process, hail, rounds)
                 while_training(table, settings, hail, rounds)
             if backend == "postgresql":
-                telling(table, settings.database_url)
+                progress_callback(table, settings.database_url)
             backends.drop(settings.database_url)
 
 
@@ -141,7 +141,7 @@ def while_training(table: Table, settings: Settings, hail: Hailing, rounds: int)
                 table.add_row(f"    {state}", f"p99 {median(p99):.2f} ms", usual + rate + spread)
 
 
-def telling(table: Table, url: str) -> None:
+def progress_callback(table: Table, url: str) -> None:
     """Measure the delay between another process's acknowledged commit and PostgreSQL's notification of it."""
     mine, another = Database(url), Database(url)
 

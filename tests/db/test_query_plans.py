@@ -11,9 +11,11 @@ from sqlalchemy import event, text
 from sqlalchemy.orm import Session
 
 from skills.db.session import Database
-from skills.jobs.workflows import Leases, Watch
+from skills.jobs.watch import Leases, Watch
 from skills.library.operation import jobs
-from skills.library.operation.overview import count_jobs, matrix, newest_job, released_styles
+from skills.library.operation.installation import count_jobs
+from skills.library.operation.overview import newest_job
+from skills.library.operation.styles import matrix, released_styles
 from skills.library.people import surgeons, suture_types
 from skills.library.policies import batches, retraining, training, versions
 from skills.library.recordings import demos, proposals

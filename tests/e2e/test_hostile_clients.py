@@ -15,7 +15,7 @@ import httpx2 as httpx
 import pytest
 from sqlalchemy import text
 
-from skills.api.dependencies import SPOOL_BYTES
+from skills.api.uploads import SPOOL_BYTES
 from skills.db.session import Database
 from skills.library.people.erasure import erase_demo
 from tests import backends

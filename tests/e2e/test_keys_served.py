@@ -49,9 +49,7 @@ def asked(http: httpx.Client, wanted: int, **headers: str) -> list[tuple[float, 
     return found
 
 
-def test_a_key_made_or_revoked_in_one_process_counts_in_another_within_1_s(
-    installation: tuple[httpx.Client, Database],
-):
+def test_a_key_made_or_revoked_in_one_process_counts_in_another_within_1_s(installation: tuple[httpx.Client, Database]):
     http, database = installation
     assert http.get("/surgeons").status_code == 200
     with database.writing() as session:

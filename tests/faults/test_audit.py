@@ -123,8 +123,8 @@ def test_a_backup_that_lacks_something_or_is_damaged_is_found(told: Told):
 @pytest.mark.nightly  # of the audit of `make faults`; by day planted losses are found
 def test_planted_doublings_are_found(told: Told):
     job = (
-        "kind, identity, progress, request, result, error, attempt, surgeon_row, plan, asked_by, told_at, created_at, "
-        "started_at, ended_at"
+        "kind, identity, progress, request, result, error, attempt, surgeon_row, plan, requested_by, submitted_at, "
+        "created_at, started_at, ended_at"
     )
     release = "policy_row, surgeon_row, suture, released_at, released_by"
     event = "subject, actor, action, object_kind, object_id, at"

@@ -23,7 +23,9 @@ from skills.formats.verify import SIGNATURE, check_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import A1, A2, Trajectory
-from skills.transparency import Checkpoint, PublicKey, SigningKey, Tree, attest, read_envelope
+from skills.transparency.merkle import Checkpoint, Tree
+from skills.transparency.signing_keys import PublicKey, SigningKey
+from skills.transparency.statements import attest, read_envelope
 from tests.formats.replays import FRAME, judged, members, papers, timetable
 from tests.formats.replays import trajectory as short
 from tests.independent_history import check_envelope

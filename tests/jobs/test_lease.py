@@ -1,6 +1,6 @@
 """Leases: the observer measures silence with its own clock, from observation to observation."""
 
-from skills.jobs.workflows import Leases
+from skills.jobs.watch import Leases
 
 
 def leases(*looks: tuple[float, dict[str, object]]) -> Leases:

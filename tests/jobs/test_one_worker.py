@@ -11,8 +11,8 @@ from sqlalchemy import inspect, text
 
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
-from skills.jobs import STEPS, WORKFLOW, connect, drop, workflow_id
-from skills.jobs.workflows import ENGINE_ATTEMPTS, Leases, Watch
+from skills.jobs import STEPS, WORKFLOW, cancel, connect, workflow_id
+from skills.jobs.watch import ENGINE_ATTEMPTS, Leases, Watch
 from skills.settings import Settings
 from tests.jobs.house import House
 from tests.waiting import until
@@ -21,15 +21,15 @@ from tests.waiting import until
 def test_a_row_that_nobody_told_of_runs(house: House):
     row = house.ask()
     assert house.ended(row).state == "succeeded"
-    until(lambda: house.job(row).told_at)
+    until(lambda: house.job(row).submitted_at)
 
 
 def test_telling_eight_times_runs_once_and_soon(house: House):
     row = house.ask()
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda _: house.engine.tell(row, 1, "training"), range(8)))
+        list(pool.map(lambda _: house.engine.submit(row, 1, "training"), range(8)))
     took_s = until(lambda: house.job(row).state == "succeeded")
-    house.engine.tell(row, 1, "training")
+    house.engine.submit(row, 1, "training")
     time.sleep(0.5)  # time for the event that must not happen
     assert len(house.noted("begins", row)) == 1
     print(f"told to succeeded: {took_s:.2f} s")
@@ -37,7 +37,7 @@ def test_telling_eight_times_runs_once_and_soon(house: House):
 
 def test_a_refusal_is_final_and_says_why(house: House):
     row = house.ask("refused")
-    house.engine.tell(row, 1, "training")
+    house.engine.submit(row, 1, "training")
     job = house.ended(row)
     assert (job.state, job.error) == ("failed", "The goal lies outside the grid; ask for another one.")
     assert len(house.noted("begins", row)) == 1
@@ -46,7 +46,7 @@ def test_a_refusal_is_final_and_says_why(house: House):
 
 def test_a_fault_is_tried_again_and_then_told_without_its_innards(house: House):
     row = house.ask("broken")
-    house.engine.tell(row, 1, "training")
+    house.engine.submit(row, 1, "training")
     job = house.ended(row)
     assert job.state == "failed"
     assert len(house.noted("begins", row)) == house.settings.job_attempts == 3
@@ -58,7 +58,7 @@ def test_a_job_cancelled_before_or_during_its_run_stays_cancelled(house: House):
     before = house.ask(state="cancelled")
     middle = house.ask("slow", seconds=1.0)
     for row in (before, middle):
-        house.engine.tell(row, 1, "training")
+        house.engine.submit(row, 1, "training")
     house.begun(middle)
     with house.database.writing() as session:
         session.execute(text("UPDATE jobs SET state = 'cancelled' WHERE row = :row"), {"row": middle})
@@ -75,7 +75,7 @@ def test_what_was_dropped_in_the_engine_is_read_back_into_the_row(house: House):
     row = house.ask("slow", seconds=1.5)
     house.begun(row)
     client = connect(house.settings)
-    drop(client, row, 1)
+    cancel(client, row, 1)
     client.destroy()
     assert house.ended(row).state == "cancelled"
     until(lambda: house.noted("came-late", row))
@@ -169,7 +169,7 @@ def test_a_silent_worker_is_forgotten_and_registered_again_when_it_beats(house: 
 
 def test_nothing_in_the_tables_of_the_engine_is_a_pickle(house: House):
     row = house.ask("broken")
-    house.engine.tell(row, 1, "training")
+    house.engine.submit(row, 1, "training")
     house.ended(row)
     database = Database(house.settings.engine_url)
     schema = "dbos" if database.engine.dialect.name == "postgresql" else None
@@ -189,7 +189,7 @@ def test_nothing_in_the_tables_of_the_engine_is_a_pickle(house: House):
 
 def test_the_first_telling_may_find_no_engine_at_all(empty_house: House):
     row = empty_house.ask()
-    empty_house.engine.tell(row, 1, "training")
+    empty_house.engine.submit(row, 1, "training")
     empty_house.engine.cancel(row, 1)
     empty_house.engine.close()
     assert empty_house.job(row).state == "queued"

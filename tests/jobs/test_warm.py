@@ -15,7 +15,7 @@ from tests.waiting import END_S
 
 WARM = """
 from threading import enumerate as threads
-from skills.jobs.readiness import TWO_POSES, align_once, learn_once, warm_up
+from skills.jobs.warm_up import TWO_POSES, align_once, learn_once, warm_up
 from skills.packing import palette_of
 def finish():
     [thread.join() for thread in threads() if thread.name == "warm-up"]

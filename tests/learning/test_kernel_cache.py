@@ -90,7 +90,7 @@ def test_a_read_only_installation_uses_the_users_cache_folder_by_default(read_on
 
 @pytest.mark.nightly  # it compiles everything
 def test_without_a_writable_folder_every_process_compiles_and_logs_it(read_only):
-    code = "from skills.jobs.readiness import learn_once, warm_up\nwarm_up(learn_once).join()\n" + LEARN
+    code = "from skills.jobs.warm_up import learn_once, warm_up\nwarm_up(learn_once).join()\n" + LEARN
     alone = told(start(code, read_only))
     assert alone["kept"] is None
     assert (alone["loaded"], alone["compiled"] > 0) == (0, True)

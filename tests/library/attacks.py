@@ -6,7 +6,7 @@ the key: the digests of the row's columns, the entry, the tree, and the checkpoi
 
 import json
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any
@@ -15,21 +15,15 @@ from sqlalchemy import Column, Connection, MetaData, Table, delete, insert, sele
 from sqlalchemy.exc import IntegrityError
 
 from skills.db import now
-from skills.db.history import (
-    ADD,
-    CHECKPOINTS,
-    LEAVES,
-    REMOVE,
-    History,
-    Latest,
-    latest_leaves,
-    new_leaf,
-)
+from skills.db.change_notes import ADD
+from skills.db.history import History
+from skills.db.leaves import CHECKPOINTS, LEAVES, Latest, NewLeaf, latest_leaves, new_leaf, removals
 from skills.db.logged_rows import CACHES, commitment_to, digests_of, logged
 from skills.db.session import Database
 from skills.library.operation.history import Finding, Verified, verify_history
 from skills.packing import canonical
-from skills.transparency import Note, Tree, leaf_hash, read_notes
+from skills.transparency.merkle import Tree, leaf_hash
+from skills.transparency.notes import Note, read_notes
 
 UNIQUE = ("sha256", "slug", "subject", "id", "identity")
 
@@ -62,17 +56,18 @@ def cover_up(connection: Connection, table: str, key: str, kind: str) -> None:
     known = latest_leaves(connection, table, [key])
     rows = list(about.rows_of(connection, [key]))
     if kind == "add":
-        salt = b"s" * 32
-        leaf = new_leaf(table, ADD, "2026-01-01T00:00:00Z", key, (salt, digests_of(about.columns, rows[0], salt)))
-        connection.execute(insert(LEAVES), [leaf | {"seal": b"f" * 32}])
+        columns = dict(zip(about.columns, rows[0], strict=True))
+        forge(connection, [new_leaf(table, ADD, "2026-01-01T00:00:00Z", key, columns)])
     elif kind == "remove":
-        leaf = new_leaf(table, REMOVE, "2026-01-01T00:00:00Z", None, None, known[key])
-        blank = {"salt": None, "digests": None, "key": None}
-        connection.execute(update(LEAVES).where(LEAVES.c.table_name == table, LEAVES.c.key == key).values(**blank))
-        connection.execute(insert(LEAVES), [leaf | {"seal": b"f" * 32}])
+        forge(connection, removals(connection, table, [key], known, "2026-01-01T00:00:00Z"))
     elif key in known:
         rewrite(connection, known[key], digests_of(about.columns, rows[0], known[key].salt))
     sign_again(connection)
+
+
+def forge(connection: Connection, leaves: Iterable[NewLeaf]) -> None:
+    """Insert leaves under a seal that no key made."""
+    connection.execute(insert(LEAVES), [{**leaf._asdict(), "seal": b"f" * 32} for leaf in leaves])
 
 
 def rewrite(connection: Connection, leaf: Latest, digests: Mapping[str, str]) -> None:

@@ -11,13 +11,14 @@ from sqlalchemy.exc import DatabaseError
 
 from skills.db import Base, now
 from skills.db import revisions as revisions_module
-from skills.db.history import LEAVES, latest_leaves
-from skills.db.logged_rows import ADDED, Logged, logged, united
+from skills.db.leaves import LEAVES, latest_leaves
+from skills.db.logged_rows import ADDED, Logged, logged
 from skills.db.revisions import revisions, upgrade
 from skills.db.session import Database
-from skills.library.operation.backup import NOTHING, back_up, restore
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import NOTHING
 from skills.library.operation.history import newest_checkpoint, sign_history
-from skills.library.operation.proofs import head_over, served_json
+from skills.library.operation.proofs import head_over, served_at
 from tests import backends
 from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed
@@ -50,7 +51,7 @@ def upgrade():
 
 
 def _forget() -> None:
-    for cached in (logged, united, revisions):
+    for cached in (logged, revisions):
         cached.cache_clear()
 
 
@@ -143,7 +144,7 @@ def _prove(database: Database) -> None:
     with database.reading() as session:
         note = newest_checkpoint(session.connection()) or ""
         verifier = database.history.key.verifier(note.partition("\n")[0])
-        said = served_json(session, database.history, "kestrel", cases.SUTURE, now())
+        said = served_at(session, database.history, "kestrel", cases.SUTURE, now())
     values = [check_disclosed(proof, note, verifier) for proof in said["proofs"]]
     assert values[1]["sha256"] == said["policy"]
 

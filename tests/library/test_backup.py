@@ -14,14 +14,8 @@ from skills.db.models import Demonstration, Erasure, Surgeon
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt, Erased
-from skills.library.operation.backup import (
-    Erasures,
-    back_up,
-    erasures_of,
-    keep_erasures,
-    read_erasures,
-    restore,
-)
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import Erasures, erasures_of, keep_erasures, read_erasures
 from skills.library.operation.inspection import inspect_installation
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
@@ -56,7 +50,7 @@ def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
     found = {}
     with database.reading() as session:
         for table in dump.tables():
-            raw = dump.Dumped(table.name, [[c.name, dump.kind_of(c)] for c in table.columns], 0, "", None, 0).table
+            raw = dump.raw_table(table.name, [(c.name, dump.kind_of(c)) for c in table.columns])
             query = select(raw).order_by(*(raw.c[key.name] for key in table.primary_key))
             found[table.name] = [tuple(row) for row in session.execute(query)]
     found["events"] = [row for row in found["events"] if "restore" not in row]
@@ -157,14 +151,14 @@ def test_jobs_that_had_not_ended_are_told_again_and_done(
     cases.add_demo(database)
     waiting, begun = cases.ask_training(database), cases.ask_training(database, seed=1)
     with database.writing() as session:
-        session.execute(text("UPDATE jobs SET told_at = created_at"))
+        session.execute(text("UPDATE jobs SET submitted_at = created_at"))
         session.execute(text("UPDATE jobs SET state = 'running' WHERE row = :row"), {"row": begun.row})
     back_up(database, tmp_path / "b.zip")
     restored = empty(OTHER[database.engine.dialect.name])
     restore(restored, tmp_path / "b.zip")
     for job in (waiting, begun):
         with restored.reading() as session:
-            assert session.get_one(Job, job.row).told_at is None
+            assert session.get_one(Job, job.row).submitted_at is None
         assert cases.work(restored, job).state == "succeeded"
 
 
@@ -174,7 +168,7 @@ def test_a_worker_of_the_restored_installation_carries_on(tmp_path: Path):
     before = House(backends.fresh("sqlite", tmp_path), tmp_path)
     row, begun = before.ask(), before.ask(state="running")
     with before.database.writing() as session:
-        session.execute(text("UPDATE jobs SET told_at = created_at"))
+        session.execute(text("UPDATE jobs SET submitted_at = created_at"))
     back_up(before.database, tmp_path / "b.zip")
     before.close()
     url = backends.blank("sqlite", tmp_path)
@@ -278,8 +272,8 @@ def test_a_demo_erased_and_added_again_before_the_backup_is_not_erased(
 def test_a_list_of_erasures_never_shrinks_and_is_refused_if_altered(database: Database, tmp_path: Path):
     kept = tmp_path / "erasures.json"
     at = datetime(2026, 1, 1, tzinfo=UTC)
-    earlier = Erasures(frozenset({("00", "11" * 32, at)}), {"demonstrations": {"ab" * 32: at}})
-    assert keep_erasures(database, kept).surgeons == set()
+    earlier = Erasures({"11" * 32: ("00", at)}, {"demonstrations": {"ab" * 32: at}})
+    assert keep_erasures(database, kept).surgeons == {}
     with database.writing() as session:
         erase_surgeon(session, "kestrel", "test")
     now_listed = keep_erasures(database, kept)

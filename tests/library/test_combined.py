@@ -16,7 +16,7 @@ from skills.learning.evaluation import dtw
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import inspect_installation, inspect_policies
 from skills.library.operation.integrity import learnt
-from skills.library.operation.overview import matrix
+from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans.plans import hand_of, trajectory_of
 from skills.library.policies import training

@@ -14,7 +14,7 @@ from skills.db.session import Database
 from skills.errors import Conflict, NotFound, SkillsError
 from skills.formats.parsed import parse_recording
 from skills.library.comparison import atlas, scores
-from skills.library.operation import overview
+from skills.library.operation import styles
 from skills.library.people import consent
 from skills.library.people.consent import covered, may
 from skills.library.people.surgeons import find_surgeon, put_surgeon
@@ -48,11 +48,11 @@ def served(database: Database) -> int | None:
     """Return the version that kestrel's style serves, None if there is none; all lists of served styles must agree."""
     with database.reading() as session:
         listed = [one.policy.version for one in versions.list_served(session, 10, None)]
-        assert [one.version for one in overview.released_styles(session)] == listed
-        assert overview.matrix(session).counts["released styles"] == len(listed)
-        shown = overview.whole_style(session, "kestrel", SUTURE)
+        assert [one.version for one in styles.released_styles(session)] == listed
+        assert styles.matrix(session).counts["released styles"] == len(listed)
+        shown = styles.whole_style(session, "kestrel", SUTURE)
         assert (shown.style.state == "released", shown.served is not None) == (bool(listed), bool(listed))
-        assert len(overview.matrix(session, state="released").rows) == len(listed)
+        assert len(styles.matrix(session, state="released").rows) == len(listed)
         try:
             version = versions.policy_of(session, "kestrel", SUTURE).policy.version
         except NotFound:

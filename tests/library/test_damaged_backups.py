@@ -121,7 +121,7 @@ def test_what_is_no_backup_or_of_another_version_is_refused(small: Path, tmp_pat
     assert "that this version can read" in refused(
         resealed(small, format="suture-skills backup 2"), tmp_path, UnknownFormat
     )
-    assert "another version" in refused(resealed(small, schema="9999"), tmp_path, Conflict)
+    assert "another version" in refused(resealed(small, revision="9999"), tmp_path, Conflict)
 
 
 def test_a_backup_that_fails_half_way_through_restoring_leaves_nothing(small: Path, tmp_path: Path):
@@ -132,7 +132,7 @@ def test_a_backup_that_fails_half_way_through_restoring_leaves_nothing(small: Pa
             raise OSError(5, "Input/output error")
 
     with pytest.raises(OSError, match="Input"):
-        restore(database, small, told=fail)
+        restore(database, small, progress=fail)
     assert inspect(database.engine).get_table_names() == []
     restore(database, small)
     expected = {one.name: one.rows for one in check_backup(small).tables}

@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import event, insert, select, text
 
 from skills import db
-from skills.db import history
+from skills.db import leaves, logged_rows
 from skills.db.models import Demonstration, MeasuredShape, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.db.service_tables import Job
 from skills.db.session import Database
@@ -19,7 +19,8 @@ from skills.library.comparison import measured
 from skills.library.comparison.atlas import atlas_of
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.operation import sweep
-from skills.library.operation.backup import back_up, erasures_of, keep_up_erasures, read_erasures, restore
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import erasures_of, keep_up_erasures, read_erasures
 from skills.library.operation.sweep import sweep_erased
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
@@ -259,7 +260,7 @@ def many_jobs(database: Database, count: int) -> None:
                 "surgeon_row": row,
                 "progress": 0.0,
                 "attempt": 1,
-                "asked_by": "t",
+                "requested_by": "t",
                 "created_at": at,
             }
             for state in ("running", *["failed"] * (count - 1))
@@ -269,7 +270,8 @@ def many_jobs(database: Database, count: int) -> None:
 
 def test_erasing_binds_no_more_parameters_for_more_rows(database: Database, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(db, "PARAMETERS", 7)
-    monkeypatch.setattr(history, "ROWS_AT_ONCE", 7)
+    for module in (leaves, logged_rows):
+        monkeypatch.setattr(module, "ROWS_AT_ONCE", 7)
     most: list[int] = []
 
     def count(_connection: Any, _cursor: Any, _statement: str, parameters: Any, _context: Any, many: bool) -> None:

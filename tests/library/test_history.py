@@ -14,10 +14,11 @@ from sqlalchemy import Connection, func, insert, null, select, text, update
 from sqlalchemy.orm import Session
 
 from skills.db import Base, now
-from skills.db.history import CHECKPOINTS, LEAVES, latest_leaves, newest_checkpoint, take_notes
-from skills.db.kept_heads import keep_head
+from skills.db.change_notes import take_notes
+from skills.db.leaves import CHECKPOINTS, LEAVES, latest_leaves, newest_checkpoint
 from skills.db.logged_rows import COLUMNS_NOT_LOGGED, NOT_LOGGED, digests_of, logged
 from skills.db.models import Release, Surgeon
+from skills.db.saved_heads import save_head
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.db.tiles import TILES, stored_tiles
@@ -25,7 +26,7 @@ from skills.errors import BadSettings, Corrupt, NotReady
 from skills.library.operation import locks, sweep
 from skills.library.operation.history import Verified, sign_history, verify_history
 from skills.library.operation.inspection import inspect_installation
-from skills.library.operation.proofs import first_head, served_json
+from skills.library.operation.proofs import first_head, served_at
 from skills.library.people import erasure
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
@@ -34,7 +35,9 @@ from skills.library.recordings import recordings
 from skills.library.recordings.recordings import stored_recording
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
-from skills.transparency import Checkpoint, SigningKey, Tree, inclusion_proof, leaf_hash, node_from, read_notes
+from skills.transparency.merkle import Checkpoint, Tree, inclusion_proof, leaf_hash, node_from
+from skills.transparency.notes import read_notes
+from skills.transparency.signing_keys import SigningKey
 from tests import backends
 from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed, check_inclusion
@@ -596,7 +599,7 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
     sign_history(database)
     asked = ("kestrel", cases.SUTURE, now())
     with database.reading() as session:
-        given = served_json(session, database.history, *asked)
+        given = served_at(session, database.history, *asked)
     for proof in given["proofs"]:
         check_disclosed(proof, given["checkpoint"]["note"], given["checkpoint"]["verifier"])
     for edit in (
@@ -607,7 +610,7 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
         with tampering(database) as connection, Session(connection) as session:
             connection.exec_driver_sql(edit.format(blob=BLOB[connection.dialect.name]))
             with pytest.raises(Corrupt, match="proves nothing"):
-                served_json(session, database.history, *asked)
+                served_at(session, database.history, *asked)
 
 
 def test_changes_of_a_row_follow_each_other_in_the_history(database: Database):
@@ -674,7 +677,7 @@ def test_a_tree_that_was_changed_is_not_signed_on(full: Database):
 
 def test_a_head_that_cannot_be_kept_is_no_reason_to_stop(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     note = SigningKey(b"k" * 32).sign(Checkpoint("suture-skills/0", 0, Tree().root))
-    keep_head(tmp_path / "none" / "heads", note)
+    save_head(tmp_path / "none" / "heads", note)
     assert "could not be appended" in caplog.text
     assert "SKILLS_CHECKPOINTS" in caplog.text
     assert os.listdir(tmp_path) == []

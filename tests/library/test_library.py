@@ -23,7 +23,7 @@ from skills.gridworld.grid import PAPER_GRID, discretisation_rmse, discretize
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.library import perform as library
-from skills.library.operation import jobs, overview
+from skills.library.operation import jobs, styles
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.people.suture_types import seed_suture_types
@@ -268,8 +268,8 @@ def test_the_first_page_shows_what_the_manifest_states(database: Database):
 
 
 def tile(session: Session) -> tuple[list[int], float]:
-    ((_, styles),) = overview.matrix(session).rows
-    shown = next(style.shown for style in styles if style.shown is not None)
+    ((_, listed),) = styles.matrix(session).rows
+    shown = next(style.shown for style in listed if style.shown is not None)
     manifest = session.scalars(select(PolicyVersion.manifest)).one()
     assert shown.grid_shape == tuple(manifest["grid"]["shape"])
     assert shown.dtw_total_mm == pytest.approx(manifest["metrics"]["dtw_total_mm"])

@@ -16,7 +16,7 @@ from skills.db.service_tables import Event, Job, StyleToRetrain, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, Erased, NotFound
 from skills.library.operation import jobs, locks
-from skills.library.operation.backup import keep_up_erasures, read_erasures
+from skills.library.operation.erasure_list import keep_up_erasures, read_erasures
 from skills.library.people.erasure import delete_recording, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job

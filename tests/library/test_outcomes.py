@@ -16,9 +16,10 @@ from skills.db.session import Database
 from skills.errors import Conflict
 from skills.formats.parsed import parse_recording
 from skills.library.comparison.scores import LEAST_DEMOS, score
-from skills.library.operation.backup import back_up, keep_erasures, read_erasures, restore
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import keep_erasures, read_erasures
 from skills.library.operation.inspection import inspect_installation
-from skills.library.operation.overview import matrix
+from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies import find_by_digest
 from skills.library.policies.cards import card_of

@@ -21,7 +21,7 @@ from skills.formats import media_type_of
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.parsed import ParsedContent, parse, parse_recording
 from skills.library.comparison import scores
-from skills.library.operation import overview
+from skills.library.operation import views
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import inspect_installation
 from skills.library.people.erasure import erase_surgeon
@@ -90,7 +90,7 @@ def test_cutting_scoring_and_the_page_do_not_decode_a_stored_recording(database:
     def results(read: Callable[..., ParsedContent]) -> list[Any]:
         demo = add_demo(database, sha256, CUT, "test", read).row.sha256
         score = scores.score(database, asked, read).model_dump() | {"curve": None}
-        return [demo, score, overview.traces_of(database, sha256, read)]
+        return [demo, score, views.traces_of(database, sha256, read)]
 
     kept = results(never)
     forget(database)

@@ -13,7 +13,8 @@ from skills.formats import write_mcap
 from skills.formats.parsed import parse_recording
 from skills.library.comparison.recognition import recognise_recording
 from skills.library.comparison.scores import score
-from skills.library.operation.backup import back_up, erasures_of, restore
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import erasures_of
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
 from skills.library.recordings.datasets import request_dataset

@@ -30,7 +30,8 @@ from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.planning.trajectory import Trajectory
 from skills.schemas.plans import PlanIn
-from skills.transparency import PublicKey, read_notes
+from skills.transparency.notes import read_notes
+from skills.transparency.signing_keys import PublicKey
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, ArmErrors
 from skills.verification.clearance import psm_m_poses
 from skills.verification.probabilities import JUDGE_VERSION

@@ -16,7 +16,8 @@ from skills.db.models import Demonstration, PolicyVersion, Release, StoredRecord
 from skills.db.service_tables import Key
 from skills.db.session import Database
 from skills.errors import BadSettings, Corrupt, NotFound
-from skills.library.operation.backup import back_up, keep_erasures, read_erasures, restore
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.erasure_list import keep_erasures, read_erasures
 from skills.library.operation.inspection import inspect_installation
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.people.keys import create_key, revoke_key

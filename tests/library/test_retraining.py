@@ -200,7 +200,7 @@ def test_parts_are_shared_out_and_nobody_sees_them(database: Database):
     assert len(parts_of(database, job)) == 14  # of three styles: enough for many workers
     with database.reading() as session:
         assert [one.id for one in jobs.list_jobs(session, 50, None, None)] == [job.id]
-        assert len(jobs.to_tell(session, job)) == 14
+        assert len(jobs.attempts_to_submit(session, job)) == 14
         with pytest.raises(NotFound):
             jobs.find_job(session, parts_of(database, job)[0].id)
 

@@ -24,20 +24,21 @@ from hypothesis import strategies as st
 from hypothesis.stateful import rule
 from sqlalchemy import select
 
-from skills.db.history import newest_checkpoint
+from skills.db.leaves import newest_checkpoint
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback
 from skills.db.service_tables import Job as JobRow
 from skills.db.session import Database
 from skills.errors import NotFound, SkillsError
 from skills.jobs.workflows import Work
 from skills.library.comparison.atlas import atlas_of
-from skills.library.operation.backup import accept_rollback, back_up, keep_erasures, read_erasures, restore
+from skills.library.operation.backup import accept_rollback, back_up, restore
+from skills.library.operation.erasure_list import keep_erasures, read_erasures
 from skills.library.operation.history import Verified, sign_history, verify_history
 from skills.library.operation.jobs import BATCH, PART
 from skills.library.perform import perform_job
 from skills.packing import sha256
 from skills.settings import Settings
-from skills.transparency import SigningKey
+from skills.transparency.signing_keys import SigningKey
 from tests import backends
 from tests.api.service import CSV, Service
 from tests.library import cases

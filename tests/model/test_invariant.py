@@ -98,7 +98,7 @@ FOUND: dict[str, list[Step]] = {
     ],
     "a_demonstration_is_withdrawn_while_a_plan_follows_it": [TRAIN, ("plan", "kestrel", (2, ("withdraw_demo", 0)))],
     "a_demonstration_is_erased_between_a_tries_check_and_its_cut": [
-        ("try", "kestrel", cases.SUTURE, 0, (7, ("erase_demo", 0))),  # heron's is of the same recording
+        ("try", "kestrel", cases.SUTURE, 0, (7, ("erase_demo", 0)))  # heron's is of the same recording
     ],
     "a_try_is_cancelled_before_its_cut": [
         ("add_recording", 1, "kestrel"),

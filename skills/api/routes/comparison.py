@@ -9,26 +9,18 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import (
-    Db,
-    Digest,
-    Parse,
-    Slug,
-    Strict,
-)
+from skills.api.dependencies import Db, Digest, Parse, Slug
 from skills.api.openapi import gives, router_of, says
 from skills.api.pages import drawings, render
-from skills.api.responses import (
-    Giving,
-    say,
-)
+from skills.api.responses import Giving, say
 from skills.api.routes.pages import PageRoute, Picked
+from skills.api.strict_json import Strict
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.comparison import scores
 from skills.library.comparison.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.comparison.recognition import recognise_recording
-from skills.library.operation import overview
+from skills.library.operation import styles
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
@@ -189,8 +181,8 @@ def show_surgeon(
     """Show a surgeon over time: the demonstrations of a suture type, session by session, beside a style's reference."""
     with db.reading() as session:
         found = find_surgeon(session, surgeon)
-        styles = [style for style in overview.styles_of(session, found) if style.demos]
-        chosen = suture or next((style.suture for style in styles), None)
+        listed = [style for style in styles.styles_of(session, found) if style.demos]
+        chosen = suture or next((style.suture for style in listed), None)
         others = scores.references(session, chosen) if chosen else []
     compared = against or next((one.slug for one in others if one.slug != surgeon), surgeon)
     shown, refused = None, ""
@@ -204,7 +196,7 @@ def show_surgeon(
         "surgeon.html",
         caller,
         surgeon=found,
-        styles=styles,
+        styles=listed,
         asked={"suture": chosen, "against": compared},
         others=others,
         shown=shown,

@@ -5,25 +5,12 @@ from functools import partial
 from fastapi import Request, Response
 
 from skills.api.authorisation import needs
-from skills.api.dependencies import (
-    Actor,
-    Db,
-    Digest,
-    Jobs,
-    Strict,
-    room_for_a_job,
-)
+from skills.api.dependencies import Actor, Db, Digest, Jobs, room_for_a_job
 from skills.api.openapi import ends, gives, gives_file, router_of, starts_job
-from skills.api.responses import (
-    Condition,
-    Giving,
-    Stream,
-    accepted,
-    as_asked,
-    names,
-    stored_pieces,
-)
+from skills.api.responses import Condition, Giving, accepted, as_asked, names
 from skills.api.routes.policies import Accept
+from skills.api.streams import Stream, stored_pieces
+from skills.api.strict_json import Strict
 from skills.formats import BYTES
 from skills.library.operation.jobs import QUEUED, did_nothing
 from skills.library.recordings import datasets
@@ -47,7 +34,7 @@ def export_dataset(body: DatasetIn, db: Db, jobs: Jobs, actor: Actor) -> Respons
         answer = accepted(session, job, QUEUED if new else did_nothing(job))
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
-        jobs.tell(job.row, job.attempt, job.kind)
+        jobs.submit(job.row, job.attempt, job.kind)
     return answer
 
 

@@ -6,32 +6,16 @@ from typing import Annotated
 from fastapi import Query, Request, Response
 
 from skills.api.authorisation import erasing_is_for_admins, needs
-from skills.api.dependencies import (
-    Actor,
-    Db,
-    Digest,
-    Incoming,
-    Jobs,
-    Limit,
-    Parse,
-    RowCursor,
-    Strict,
-)
+from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, Parse, RowCursor
 from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
-from skills.api.responses import (
-    Condition,
-    Giving,
-    Stream,
-    as_asked,
-    names,
-    refuse_changed,
-    stored,
-    stored_pieces,
-)
+from skills.api.responses import Condition, Giving, as_asked, names, refuse_changed, stored
 from skills.api.routes.policies import Accept
 from skills.api.routes.recordings import RAW_BODY
+from skills.api.streams import Stream, stored_pieces
+from skills.api.strict_json import Strict
+from skills.api.uploads import Incoming
 from skills.formats import BYTES, MEDIA_TYPES
 from skills.library.operation import locks
 from skills.library.operation.sweep import drop_contents, sweep_erased

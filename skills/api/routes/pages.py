@@ -1,24 +1,27 @@
 """Routes of the web pages and of the files that they load. Pages only read; changes go through the public calls."""
 
 from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
 import orjson
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from sqlalchemy.orm import Session
 
 from skills import errors
-from skills.api.authorisation import Asking, needs, open_to_all
+from skills.api.authorisation import Asking, Caller, needs, open_to_all
 from skills.api.dependencies import Configured, Db, Digest, Limit, Parse, RowCursor, Slug, SlugCursor
-from skills.api.pages import assets, build, drawings, render
+from skills.api.pages import drawings, render
+from skills.api.pages.assets import assets, build
 from skills.api.responses import JSON
 from skills.api.routes.policies import JobId, Version
+from skills.db.session import Database
 from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library.comparison import scores
-from skills.library.operation import jobs, overview
+from skills.library.operation import jobs, overview, styles, views
 from skills.library.people.surgeons import list_surgeons
 from skills.library.plans.plans import find_plan, followed_plan, hands_over, plan_in_words
 from skills.library.plans.playbacks import headline_of
@@ -71,6 +74,24 @@ class PageRoute(APIRoute):
         return answer_or_tell
 
 
+@dataclass(frozen=True)
+class Asked:
+    """The request for a page, its caller, and the database restricted to the rows that the caller may see."""
+
+    request: Request
+    caller: Caller
+    db: Database
+
+    def show(self, template: str, **context: Any) -> Response:
+        """Render a template."""
+        return render(self.request, template, self.caller, **context)
+
+
+async def _asked(request: Request, caller: Asking, db: Db) -> Asked:
+    return Asked(request, caller, db)
+
+
+Page = Annotated[Asked, Depends(_asked)]
 router = APIRouter(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
 
 
@@ -89,42 +110,38 @@ def get_static(version: str, name: str, request: Request) -> Response:
 
 @router.get("/", dependencies=[needs("reader")])
 def show_catalogue(
-    request: Request,
-    caller: Asking,
-    db: Db,
+    page: Page,
     q: Words = "",
     state: Literal["", "released", "trained", "stored", "empty"] = "",
     skill: Literal["", "novice", "intermediate", "expert"] = "",
     cursor: SlugCursor = None,
 ) -> Response:
     """Show the styles: surgeons and suture types, with their stored, trained and released state."""
-    with db.reading() as session:
-        found = overview.matrix(session, q, state or None, skill or None, cursor)
+    with page.db.reading() as session:
+        found = styles.matrix(session, q, state or None, skill or None, cursor)
         asked = {"q": q, "state": state, "skill": skill}
-        known: dict[str, Any] = {"sutures": overview.all_suture_types(session), "most_counted": overview.MOST_COUNTED}
-        return render(request, "catalogue.html", caller, found=found, asked=asked, **known)
+        known: dict[str, Any] = {"sutures": overview.all_suture_types(session), "most_counted": styles.MOST_COUNTED}
+        return page.show("catalogue.html", found=found, asked=asked, **known)
 
 
 @router.get("/pages/styles/{surgeon}/{suture}", dependencies=[needs("reader")])
 def show_style(
     surgeon: Slug,
     suture: Slug,
-    request: Request,
-    caller: Asking,
-    db: Db,
+    page: Page,
     version: Annotated[int | None, Query(ge=1)] = None,
     beside: Annotated[int | None, Query(ge=1)] = None,
 ) -> Response:
     """Show a style in 3-D, with its figures, versions and demonstrations; `beside` is a version to compare with."""
-    with db.reading() as session:
-        whole = overview.whole_style(session, surgeon, suture)
+    with page.db.reading() as session:
+        whole = styles.whole_style(session, surgeon, suture)
         shown = _chosen(session, whole, version)
         other = None if beside is None else versions.find_version(session, surgeon, suture, beside)
         most = overview.MOST_LISTED
-        return render(request, "style.html", caller, whole=whole, shown=shown, other=other, most=most)
+        return page.show("style.html", whole=whole, shown=shown, other=other, most=most)
 
 
-def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -> Any:
+def _chosen(session: Session, whole: styles.WholeStyle, version: int | None) -> Any:
     """Return the version to show: the requested one, else the served one, else the newest."""
     if version is not None:
         return versions.find_version(session, whole.surgeon.slug, whole.suture.slug, version)
@@ -137,34 +154,34 @@ def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -
 def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, db: Db) -> Response:
     """Return the data of a version's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_version(versions.choose(session, surgeon, suture, version)))
+        return _json(views.view_of_version(versions.choose(session, surgeon, suture, version)))
 
 
 @router.get("/pages/demos/{demo}/view", dependencies=[needs("reader")])
 def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
     """Return the data of a demonstration's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_demo(session, shown_demo(session, demo)))
+        return _json(views.view_of_demo(session, shown_demo(session, demo)))
 
 
 @router.get("/pages/demos/{demo}/score", dependencies=[needs("reader")])
 def show_score(
     demo: Digest,
-    request: Request,
-    caller: Asking,
-    db: Db,
+    page: Page,
     tell: Parse,
     surgeon: Annotated[str, Query(max_length=64)] = "",
     task: Annotated[str, Query(max_length=64, pattern="^[A-Za-z_]*$")] = "",
 ) -> Response:
     """Show the score of a demonstration against a surgeon's style; by default that of an expert, if there is one."""
-    with db.reading() as session:
+    with page.db.reading() as session:
         found = find_demo(session, demo)
         surgeons = scores.references(session, found.suture)
         tasks = scores.rated_tasks(session)
     others = [one.slug for one in surgeons if one.row != found.surgeon_row]
     against = surgeon or next(iter(others), found.surgeon.slug)
-    score = scores.score(db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256, task=task or None), tell)
+    score = scores.score(
+        page.db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256, task=task or None), tell
+    )
     drawn: dict[str, Any] = {
         "views": drawings.deviation_views(score.deviation),
         "along": drawings.deviation_along(score.deviation),
@@ -172,25 +189,23 @@ def show_score(
         "key": drawings.score_key(),
     }
     drawn |= {"surgeons": surgeons, "tasks": tasks, "asked_task": task}
-    return render(request, "score.html", caller, demo=found, score=score, **drawn)
+    return page.show("score.html", demo=found, score=score, **drawn)
 
 
 @router.get("/pages/recordings", dependencies=[needs("reader")])
-def show_recordings(request: Request, caller: Asking, db: Db, cursor: RowCursor = None) -> Response:
+def show_recordings(page: Page, cursor: RowCursor = None) -> Response:
     """Show the newest recordings."""
-    with db.reading() as session:
+    with page.db.reading() as session:
         found = overview.newest_recordings(session, cursor)
-        return render(request, "recordings.html", caller, found=found, most=overview.MOST)
+        return page.show("recordings.html", found=found, most=overview.MOST)
 
 
 @router.get("/pages/recordings/new", dependencies=[needs("reader")])
-def show_upload(request: Request, caller: Asking, db: Db, surgeon: Picked = None, suture: Picked = None) -> Response:
+def show_upload(page: Page, surgeon: Picked = None, suture: Picked = None) -> Response:
     """Show the form that uploads a recording."""
-    with db.reading() as session:
-        return render(
-            request,
+    with page.db.reading() as session:
+        return page.show(
             "upload.html",
-            caller,
             kinds=MEDIA_TYPES,
             suffixes=SUFFIXES,
             instruments=list(INSTRUMENTS),
@@ -201,17 +216,13 @@ def show_upload(request: Request, caller: Asking, db: Db, surgeon: Picked = None
 
 
 @router.get("/pages/recordings/{recording}", dependencies=[needs("reader")])
-def show_recording(
-    recording: Digest, request: Request, caller: Asking, db: Db, surgeon: Picked = None, suture: Picked = None
-) -> Response:
+def show_recording(recording: Digest, page: Page, surgeon: Picked = None, suture: Picked = None) -> Response:
     """Show a recording: its quality, its proposed hand-offs, and the demonstrations cut out of it."""
-    with db.reading() as session:
+    with page.db.reading() as session:
         found = find_recording(session, recording)
         demos = overview.demos_of_recording(session, found)
-        return render(
-            request,
+        return page.show(
             "recording.html",
-            caller,
             found=found,
             demos=demos,
             taken=[[demo.start_s, demo.end_s] for demo in demos if demo.withdrawn_at is None],
@@ -225,46 +236,42 @@ def show_recording(
 @router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
 def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Parse) -> Response:
     """Return the data of a recording's timeline."""
-    return _json(overview.traces_of(db, recording, tell))
+    return _json(views.traces_of(db, recording, tell))
 
 
 @router.get("/pages/plans", dependencies=[needs("reader")])
-def show_plans(request: Request, caller: Asking, db: Db, settings: Configured, cursor: RowCursor = None) -> Response:
+def show_plans(page: Page, settings: Configured, cursor: RowCursor = None) -> Response:
     """Show the newest plans with their verdicts."""
-    with db.reading() as session:
+    with page.db.reading() as session:
         found = [
             (plan, plan_in_words(plan.about), None if played is None else headline_of(played, settings))
             for plan, played in overview.newest_plans(session, cursor)
         ]
-        return render(request, "plans.html", caller, found=found, most=overview.MOST)
+        return page.show("plans.html", found=found, most=overview.MOST)
 
 
 @router.get("/pages/plans/new", dependencies=[needs("reader")])
 def show_plan_editor(
-    request: Request,
-    caller: Asking,
-    db: Db,
+    page: Page,
     surgeon: Picked = None,
     suture: Picked = None,
     version: Annotated[int | None, Query(ge=1)] = None,
     like: Annotated[str | None, Query(pattern=DIGEST)] = None,
 ) -> Response:
     """Show the plan editor, filled from a style or from an existing plan."""
-    with db.reading() as session:
+    with page.db.reading() as session:
         before = None if like is None else find_plan(session, like)
         if before is not None:
             surgeon, suture = before.policy.surgeon.slug, before.policy.suture
             version = before.policy.version
-        released = overview.released_styles(session)
+        released = styles.released_styles(session)
         policy = None
         if surgeon is not None and suture is not None:
             policy = versions.choose(session, surgeon, suture, version)
         elif released:
             policy = versions.choose(session, released[0].surgeon, released[0].suture, released[0].version)
-        return render(
-            request,
+        return page.show(
             "plan_editor.html",
-            caller,
             released=released,
             most=overview.MOST_LISTED,
             is_served=policy is not None and releases.serves(session, policy),
@@ -284,15 +291,13 @@ def _assumed_psm_m(goal_mm: list[float]) -> dict[str, str]:
 
 
 @router.get("/pages/plans/{plan}", dependencies=[needs("reader")])
-def show_plan(plan: Digest, request: Request, caller: Asking, db: Db, settings: Configured) -> Response:
+def show_plan(plan: Digest, page: Page, settings: Configured) -> Response:
     """Show a plan with its playbacks."""
-    with db.reading() as session:
+    with page.db.reading() as session:
         found = followed_plan(session, plan)
         refusal = refusal_of_bag(session, found, settings)
-        return render(
-            request,
+        return page.show(
             "plan.html",
-            caller,
             plan=found,
             played=[(one, headline_of(one.playback, settings)) for one in overview.playbacks_of(session, found)],
             in_words=plan_in_words(found.about),
@@ -304,18 +309,14 @@ def show_plan(plan: Digest, request: Request, caller: Asking, db: Db, settings: 
 
 @router.get("/pages/jobs", dependencies=[needs("reader")])
 def show_jobs(
-    request: Request,
-    caller: Asking,
-    db: Db,
+    page: Page,
     state: Literal["", "queued", "running", "succeeded", "failed", "cancelled"] = "",
     cursor: RowCursor = None,
 ) -> Response:
     """Show jobs, the newest first, and the form that starts a batch."""
-    with db.reading() as session:
-        return render(
-            request,
+    with page.db.reading() as session:
+        return page.show(
             "jobs.html",
-            caller,
             found=jobs.list_jobs(session, overview.MOST, cursor, state or None),
             state=state,
             most=overview.MOST,
@@ -325,17 +326,13 @@ def show_jobs(
 
 
 @router.get("/pages/jobs/{job}", dependencies=[needs("reader")])
-def show_job(
-    job: JobId, request: Request, caller: Asking, db: Db, limit: Limit = overview.MOST, cursor: RowCursor = None
-) -> Response:
+def show_job(job: JobId, page: Page, limit: Limit = overview.MOST, cursor: RowCursor = None) -> Response:
     """Show a job as it runs, and the styles of a batch."""
-    with db.reading() as session:
+    with page.db.reading() as session:
         found = jobs.find_job(session, job)
         batch = found.kind == jobs.BATCH
-        return render(
-            request,
+        return page.show(
             "job.html",
-            caller,
             job=found,
             came_of=outcomes_of(session, [found])[found.row],
             counts=jobs.count(session, found.row) if batch else None,
@@ -345,13 +342,11 @@ def show_job(
 
 
 @router.get("/pages/catalogue", dependencies=[needs("reader")])
-def show_people(request: Request, caller: Asking, db: Db, q: Words = "", cursor: SlugCursor = None) -> Response:
+def show_people(page: Page, q: Words = "", cursor: SlugCursor = None) -> Response:
     """Show surgeons and suture types, with forms that add and change them."""
-    with db.reading() as session:
-        return render(
-            request,
+    with page.db.reading() as session:
+        return page.show(
             "people.html",
-            caller,
             q=q,
             surgeons=list_surgeons(session, overview.MOST, cursor, q or None),
             most=overview.MOST,

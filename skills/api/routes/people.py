@@ -5,9 +5,10 @@ from typing import Annotated
 from fastapi import Path, Query, Request, Response
 
 from skills.api.authorisation import needs
-from skills.api.dependencies import Actor, Db, Jobs, Limit, RowCursor, Slug, SlugCursor, Strict
+from skills.api.dependencies import Actor, Db, Jobs, Limit, RowCursor, Slug, SlugCursor
 from skills.api.openapi import ends, gives, gives_page, makes, router_of, says
 from skills.api.responses import Condition, Giving, refuse_changed, say, stored
+from skills.api.strict_json import Strict
 from skills.library.operation import locks
 from skills.library.operation.sweep import drop_contents, sweep_erased
 from skills.library.people import erasure, surgeons, suture_types

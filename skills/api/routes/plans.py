@@ -16,26 +16,15 @@ from fastapi import Query, Request, Response
 from pydantic import Field
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import (
-    Actor,
-    Configured,
-    Db,
-    Digest,
-    Incoming,
-    Jobs,
-    Limit,
-    Parse,
-    Read,
-    RowCursor,
-    Strict,
-    room_for_a_job,
-)
+from skills.api.dependencies import Actor, Configured, Db, Digest, Jobs, Limit, Parse, Read, RowCursor, room_for_a_job
 from skills.api.openapi import gives, gives_file, gives_page, makes, router_of, says, starts_job
 from skills.api.pages import render
 from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
 from skills.api.routes.pages import PageRoute
 from skills.api.routes.policies import Accept
 from skills.api.routes.recordings import RAW_BODY
+from skills.api.strict_json import Strict
+from skills.api.uploads import Incoming
 from skills.db.session import Database
 from skills.errors import UnknownFormat
 from skills.fields import as_json
@@ -117,7 +106,7 @@ def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configure
         answer = accepted(session, job, QUEUED if new else did_nothing(job))
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
-        jobs.tell(job.row, job.attempt, job.kind)
+        jobs.submit(job.row, job.attempt, job.kind)
     return answer
 
 

@@ -7,45 +7,23 @@ values only.
 import hashlib
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import Header, Path, Query, Request, Response, WebSocket
 from sqlalchemy.orm import Session
 
 from skills.api.authorisation import Asking, needs, refuse_release
-from skills.api.dependencies import (
-    Actor,
-    Configured,
-    Db,
-    Digest,
-    Jobs,
-    Limit,
-    RowCursor,
-    Slug,
-    Strict,
-    room_for_a_job,
-)
+from skills.api.dependencies import Actor, Configured, Db, Digest, Jobs, Limit, RowCursor, Slug, room_for_a_job
+from skills.api.encoded_policies import NPZ, Encoded, negotiate
+from skills.api.job_events import Watching
 from skills.api.openapi import ends, gives, gives_page, gives_stream, router_of, says, starts_job
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import card_page
 from skills.api.policy_cache import POSES, SIGNATURE, PolicyCache
-from skills.api.responses import (
-    JSON,
-    NPZ,
-    Condition,
-    Encoded,
-    Giving,
-    Stream,
-    Watching,
-    accepted,
-    answer,
-    json_of,
-    names,
-    negotiate,
-    say,
-    tag_of,
-)
+from skills.api.responses import JSON, Condition, Giving, accepted, answer, json_of, names, say, tag_of
 from skills.api.sessions import Sessions
+from skills.api.streams import Stream
+from skills.api.strict_json import Strict
 from skills.db.models import PolicyVersion
 from skills.db.session import Database
 from skills.errors import PreconditionFailed
@@ -53,20 +31,19 @@ from skills.learning.policy import next_step
 from skills.library.operation import jobs as asked
 from skills.library.operation import locks
 from skills.library.operation.integrity import learnt
-from skills.library.operation.jobs import PART, count, job_json, to_tell
+from skills.library.operation.jobs import PART, attempts_to_submit, count
 from skills.library.operation.proofs import head_over, sign_files
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.library.plans.tries import request_try
 from skills.library.policies import releases, versions
 from skills.library.policies.cards import Card, card_of
-from skills.library.policies.releases import outcomes_of, outcomes_of_styles
+from skills.library.policies.releases import outcomes_of_styles
 from skills.library.policies.retraining import find_retraining, list_styles, request_retraining, retrained_json
 from skills.library.policies.training import near_limits, odds_limits, request_training
 from skills.library.policies.versions import about_next, poses_of, summary_json, version_json
 from skills.schemas import Page
 from skills.schemas.cards import PolicyCard
-from skills.schemas.given import SignedEnvelope
 from skills.schemas.operation import Job
 from skills.schemas.policies import NextStep, Policy, PolicySummary, Rollout, RolloutIn
 from skills.schemas.policies import Version as GivenVersion
@@ -75,7 +52,8 @@ from skills.schemas.requests import JOB, SLUG
 from skills.schemas.training import Retraining, RetrainingIn, TrainingIn
 from skills.schemas.tries import TryIn
 from skills.settings import MEBIBYTE
-from skills.transparency import read_notes
+from skills.transparency.notes import read_notes
+from skills.transparency.statements import SignedEnvelope
 
 job_router = router_of(route_class=Strict, tags=["jobs"], max_body_size=MEBIBYTE)
 
@@ -101,7 +79,7 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, se
         answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
-        jobs.tell(job.row, job.attempt, job.kind)
+        jobs.submit(job.row, job.attempt, job.kind)
     return answer
 
 
@@ -117,7 +95,7 @@ def try_recording(body: TryIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking)
         job, new, did = request_try(session, body, actor)
         answer = accepted(session, job, did)
     if new:
-        jobs.tell(job.row, job.attempt, job.kind)
+        jobs.submit(job.row, job.attempt, job.kind)
     return answer
 
 
@@ -133,15 +111,14 @@ def list_jobs(
     """List jobs, the newest first."""
     with db.reading() as session:
         found = asked.list_jobs(session, limit, cursor, state, kind)
-        came_of = outcomes_of(session, found)
-        said = [job_json(job, came_of[job.row]) for job in found]
-        return give.page(said, limit, found[-1].row if found else None)
+        return give.page(asked.describe_jobs(session, found), limit, found[-1].row if found else None)
 
 
 @job_router.get("/jobs/{job}", dependencies=[needs("reader")], **gives(Job, 404))
 def get_job(job: JobId, db: Db, give: Giving) -> Response:
     """Return a job."""
-    return give(_look(db, job))
+    with db.reading() as session:
+        return give(asked.describe_job(session, asked.find_job(session, job)))
 
 
 @job_router.get("/jobs/{job}/events", dependencies=[needs("reader")], **EVENTS)
@@ -159,17 +136,11 @@ def cancel_job(job: JobId, db: Db, jobs: Jobs, actor: Actor) -> Response:
         row = asked.find_job(session, job).row
     with db.writing([locks.job(row)]) as session:
         cancelled = asked.cancel(session, job, actor)
-        told = to_tell(session, cancelled)
-        said = job_json(cancelled, outcomes_of(session, [cancelled])[cancelled.row])
+        told = attempts_to_submit(session, cancelled)
+        said = asked.describe_job(session, cancelled)
     for row, attempt in told:
         jobs.cancel(row, attempt)
     return say(said)
-
-
-def _look(db: Database, job: str) -> dict[str, Any]:
-    with db.reading() as session:
-        found = asked.find_job(session, job)
-        return job_json(found, outcomes_of(session, [found])[found.row])
 
 
 retraining_router = router_of(route_class=Strict, tags=["jobs"], max_body_size=MEBIBYTE)
@@ -185,10 +156,10 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
     refuse_release(caller, body.release)
     job, new, did = request_retraining(db, body, actor, near_limits(settings), odds_limits(settings))
     with db.reading() as session:
-        told = to_tell(session, job) if new else []
+        told = attempts_to_submit(session, job) if new else []
         answer = accepted(session, job, did)
     for row, attempt in told:
-        jobs.tell(row, attempt, PART)
+        jobs.submit(row, attempt, PART)
     return answer
 
 
@@ -205,7 +176,7 @@ def get_retraining(
     with db.reading() as session:
         found = find_retraining(session, job)
         styles = list_styles(session, found, limit, cursor, state)
-        about = job_json(found, outcomes_of(session, [found])[found.row]) | {"styles": count(session, found.row)}
+        about = {**dict(asked.describe_job(session, found)), "styles": count(session, found.row)}
         came_of = outcomes_of_styles(session, styles)
         items = [retrained_json(style, came_of[style.row]) for style in styles]
         return give.page(items, limit, styles[-1].row if styles else None, **about)

@@ -11,11 +11,11 @@ from skills.client.files import write_file
 from skills.errors import BadInput
 from skills.keywords import RetrainingKeywords, TrainingKeywords, TryKeywords
 from skills.schemas.cards import PolicyCard
-from skills.schemas.given import SignedEnvelope
 from skills.schemas.operation import Job
 from skills.schemas.policies import NextStep, Policy, PolicySummary, Rollout, Version
 from skills.schemas.pose_styles import NextPose, PoseStyle
 from skills.schemas.training import RetrainedStyle, Retraining
+from skills.transparency.statements import SignedEnvelope
 
 if TYPE_CHECKING:
     from skills.learning.policy import Policy as LearntPolicy

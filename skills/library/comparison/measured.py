@@ -22,7 +22,7 @@ from skills.comparison.recognition import NUMBERS, signature_of
 from skills.db import in_parts
 from skills.db.models import Demonstration, MeasuredShape
 from skills.db.packed import pack
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPath, Busy
@@ -205,7 +205,7 @@ def store_shapes(database: Database, measured: Mapping[int, Measured]) -> None:
     with database.writing([locks.DISTANCES]) as session:
         for some in in_parts(named):  # also of surgeons that this caller may not see
             there = select(func.count()).select_from(Demonstration).where(Demonstration.row.in_(some))
-            if session.scalar(there, execution_options=EVERYBODYS) != len(some):
+            if session.scalar(there, execution_options=ALL_ROWS) != len(some):
                 return
         session.execute(delete(MeasuredShape).where(MeasuredShape.demonstration_row.in_(measured)))
         session.execute(insert(MeasuredShape), packed)

@@ -27,7 +27,7 @@ from skills.comparison.distances import STATES, in_lengths
 from skills.comparison.nearest import ShapeIndex
 from skills.db import in_parts
 from skills.db.models import Demonstration, Surgeon
-from skills.db.row_visibility import EVERYBODYS, ONLY
+from skills.db.row_visibility import ALL_ROWS, ONLY
 from skills.db.session import Database
 from skills.errors import BadPath, Busy, Conflict
 from skills.library.comparison.atlas import DISTANCE, NO_DIRECTION, UNITS
@@ -164,7 +164,7 @@ class _Listed:
 
 
 def _listed(session: Session, suture: str, *, unrestricted: bool = False) -> _Listed:
-    options = EVERYBODYS if unrestricted else {}
+    options = ALL_ROWS if unrestricted else {}
     of = Demonstration.row
     surgeons = [one.row for one in session.scalars(select(Surgeon), execution_options=options) if may(one, "atlas")]
     figures = [func.count(), func.coalesce(func.sum(of), 0), func.coalesce(func.max(of), 0)]
@@ -180,7 +180,7 @@ def _of_each(
 ) -> list[Row[Any]]:
     """Aggregate the rows of surgeons' demonstrations; an index alone has them, where a row has the whole motion."""
     query = select(*columns).where(Demonstration.suture == suture)
-    options = EVERYBODYS if unrestricted else {}
+    options = ALL_ROWS if unrestricted else {}
     return [
         session.execute(query.where(Demonstration.surgeon_row.in_(some)), execution_options=options).one()
         for some in in_parts(surgeons)

@@ -21,41 +21,26 @@ from typing import Any
 from sqlalchemy import Connection, exists, select, text
 
 from skills.db import in_parts
-from skills.db.history import (
-    CHECKPOINTS,
-    LEAVES,
-    REMOVE,
-    SCHEMA,
-    History,
-    Latest,
-    latest_leaves,
-    newest_checkpoint,
-)
-from skills.db.kept_heads import keep_head
-from skills.db.logged_rows import (
-    CACHES,
-    ROWS_AT_ONCE,
-    Logged,
-    commitment_to,
-    logged,
-    schema_of,
-)
+from skills.db.change_notes import REMOVE
+from skills.db.history import SCHEMA, History
+from skills.db.leaves import CHECKPOINTS, LEAVES, Latest, latest_leaves, newest_checkpoint
+from skills.db.logged_rows import CACHES, ROWS_AT_ONCE, Logged, commitment_to, logged, schema_of
+from skills.db.saved_heads import save_head
 from skills.db.session import Database
 from skills.db.tiles import TILES, fill_tiles, full_tiles, stored_tiles
 from skills.errors import BadSettings, Corrupt, NotReady, SkillsError
 from skills.remedies import Action, Remedy
-from skills.transparency import (
+from skills.transparency.merkle import (
     TILE_WIDTH,
     Checkpoint,
-    Note,
     Tree,
     inclusion_proof,
     leaf_hash,
     node_from,
     proven_root,
-    read_notes,
     root_of,
 )
+from skills.transparency.notes import Note, read_notes
 
 SIGNING_LOCK = 0x5C112  # ours: the number of the advisory lock under which one process at a time signs
 SIGNING_S = 0.5  # ours: a worker must write its heartbeat meanwhile
@@ -91,11 +76,11 @@ def sign_history(database: Database, at_most_s: float = inf) -> str | None:
     with database.reading() as session:  # also what others signed, or this process before it was killed
         newest = newest_checkpoint(session.connection())
     if newest is not None:
-        keep_head(database.history.heads_file, newest)
+        save_head(database.history.heads_file, newest)
     return note
 
 
-def is_right(database: Database) -> bool:
+def is_last_signed(database: Database) -> bool:
     """Return whether it is the database that was signed last; log the reason when it is found not to be."""
     before = database.history.refused
     try:
@@ -107,9 +92,9 @@ def is_right(database: Database) -> bool:
     return True
 
 
-def keep_signed(database: Database, at_most_s: float = SIGNING_S) -> bool:
+def sign_some_history(database: Database, at_most_s: float = SIGNING_S) -> bool:
     """Sign some of the history, if it is the right one, and return whether it is; work goes on where signing fails."""
-    if not is_right(database):
+    if not is_last_signed(database):
         return False
     try:
         sign_history(database, at_most_s)
@@ -122,7 +107,7 @@ def _sign_some(database: Database) -> str | None:
     with database.reading() as session:
         if not session.scalar(select(exists().where(LEAVES.c.number.is_(None)))):
             return None
-    with database.writing(()) as session:  # nobody waits for it: it changes no row but its own
+    with database.writing(()) as session:  # no other job depends on it
         connection = session.connection()
         if connection.dialect.name == "postgresql":
             mine = connection.scalar(text("SELECT pg_try_advisory_xact_lock(:lock)"), {"lock": SIGNING_LOCK})
@@ -256,7 +241,7 @@ def verify_history(
             yield name, "it is not signed with the key of this installation"
     if since is None:
         yield "history", "no checkpoint is signed with the key of this installation"
-    for note in history.kept_heads(origin) if heads is None else heads:
+    for note in history.saved_heads(origin) if heads is None else heads:
         name = f"head of {note.checkpoint.size} leaves"
         if note.checkpoint.origin != origin:
             yield name, f"it is of the history {note.checkpoint.origin}, and this one is {origin}"

@@ -13,6 +13,7 @@ import hashlib
 import secrets
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -56,7 +57,7 @@ from skills.library.recordings.recordings import Parser, recording_bytes
 from skills.packing import canonical, sha256
 from skills.schemas.policy_document import policy_identity
 from skills.settings import Settings
-from skills.transparency import Note
+from skills.transparency.notes import Note
 
 ROWS_AT_ONCE = 100
 WITH_OTHERS = {RecordingChunk, ParsedChunk, DatasetChunk}  # checked with the row that they belong to
@@ -75,6 +76,20 @@ class Checked:
     wrong: list[tuple[str, str]] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)  # not, or not wholly, compared, each with the reason
     of: int | None = None  # the number of items that will be checked, where it is known before
+
+    @contextmanager
+    def noting(self, name: str) -> Iterator[None]:
+        """Note an error of the block, such as of a damaged page of the database file, under a name.
+
+        Raises:
+            Busy: The database cannot be read any more.
+        """
+        try:
+            yield
+        except Busy:
+            raise
+        except Exception as error:
+            self.wrong.append((name, _describe(error)))
 
 
 def inspect_installation(
@@ -118,13 +133,8 @@ def inspect_installation(
 def _at_once(what: str, look: Callable[[Session, Checked], None], database: Database) -> Iterator[Checked]:
     checked = Checked(what)
     yield checked
-    try:
-        with database.reading() as session:
-            look(session, checked)
-    except Busy:
-        raise
-    except Exception as error:
-        checked.wrong.append((what, _in_words(error)))
+    with checked.noting(what), database.reading() as session:
+        look(session, checked)
     yield checked
 
 
@@ -198,16 +208,11 @@ def _rows(database: Database, mapper: Mapper[Any]) -> Iterator[Checked]:
         query = select(*keys).order_by(*keys).limit(ROWS_AT_ONCE)
         if last is not None:
             query = query.where(tuple_(*keys) > tuple_(*last))
-        try:
-            with database.reading() as session:
-                page = [tuple(row) for row in session.execute(query)]
-                for key, why in _look(session, mapper, keys, page):
-                    checked.wrong.append((_name(table, key), why))
-        except Busy:
-            raise
-        except Exception as error:  # such as a damaged page of the database file
-            checked.wrong.append((table.name, f"after {last}: {_in_words(error)}"))
-            break
+        page: list[tuple[Any, ...]] = []
+        with checked.noting(f"{table.name} after {last}"), database.reading() as session:
+            page = [tuple(row) for row in session.execute(query)]
+            for key, why in _look(session, mapper, keys, page):
+                checked.wrong.append((_name(table, key), why))
         checked.count += len(page)
         if len(page) < ROWS_AT_ONCE:
             break
@@ -230,7 +235,7 @@ def _look(
             try:
                 row = session.get(mapper.class_, key, options=later)
             except Exception as error:
-                yield key, _in_words(error)
+                yield key, _describe(error)
             else:
                 rows.extend([] if row is None else [row])  # None: erased since the page was read
     while rows:
@@ -252,19 +257,19 @@ def _wrong_with(row: Any, packed: Sequence[str]) -> Why:
         try:
             getattr(row, name)
         except Exception as error:
-            yield f"{name}: {_in_words(error)}"
+            yield f"{name}: {_describe(error)}"
             return
     try:
         yield from AGREES.get(type(row), lambda _: iter(()))(row)
     except Exception as error:
-        yield _in_words(error)
+        yield _describe(error)
 
 
 def _name(table: Table, key: Sequence[Any]) -> str:
     return f"{table.name} {'/'.join(map(str, key))}"
 
 
-def _in_words(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     """Return an error as text; one that is not ours might quote stored values, so only its type is named."""
     return error.words() if isinstance(error, SkillsError) else f"it cannot be read ({type(error).__name__})"
 
@@ -278,18 +283,14 @@ def _decoded_again(database: Database, tell: Parser, every: bool) -> Iterator[Ch
     yield checked
     query = select(ParsedRecording.recording_row).where(ParsedRecording.version == READER_VERSION)
     query = query.order_by(ParsedRecording.recording_row.desc())
-    try:
-        with database.reading() as session:
-            rows = session.scalars(query if every else query.limit(1)).all()
-        for row in rows:
-            for why in _decoded_otherwise(database, row, tell):
-                checked.wrong.append((f"recordings {row}", why))
-            checked.count += 1
-            yield checked
-    except Busy:
-        raise
-    except Exception as error:  # such as a schema without the cache
-        checked.wrong.append((checked.what, _in_words(error)))
+    rows: Sequence[int] = ()
+    with checked.noting(checked.what), database.reading() as session:
+        rows = session.scalars(query if every else query.limit(1)).all()
+    for row in rows:
+        with checked.noting(f"recordings {row}"):
+            checked.wrong += [(f"recordings {row}", why) for why in _decoded_otherwise(database, row, tell)]
+        checked.count += 1
+        yield checked
     yield checked
 
 
@@ -333,37 +334,25 @@ def _again(
 ) -> Iterator[Checked]:
     """Compute policy versions again that are not done yet, and compare each with what is stored."""
     yield checked
-    try:
-        with database.reading() as session:
-            every = session.scalars(select(PolicyVersion.row).order_by(PolicyVersion.row))
-            rows = [row for row in every if row not in done]
-        if limit is not None and limit < len(rows):
-            rows = sorted(secrets.SystemRandom().sample(rows, limit))
-        checked.of = len(rows)
-        for row in rows:
-            name = f"{PolicyVersion.__tablename__} {row}"
-            try:
-                found = compare(row)
-            except Busy:
-                raise
-            except (Corrupt, NotFound):  # reported with the row; erased since
-                pass
-            except Exception as error:
-                checked.wrong.append((name, _in_words(error)))
+    rows: list[int] = []
+    with checked.noting(checked.what), database.reading() as session:
+        every = session.scalars(select(PolicyVersion.row).order_by(PolicyVersion.row))
+        rows = [row for row in every if row not in done]
+    if limit is not None and limit < len(rows):
+        rows = sorted(secrets.SystemRandom().sample(rows, limit))
+    checked.of = len(rows)
+    for row in rows:
+        name = f"{PolicyVersion.__tablename__} {row}"
+        with checked.noting(name), suppress(Corrupt, NotFound):  # reported with the row; erased since
+            found = compare(row)
+            if found.left_out is None:
+                done.add(row)
             else:
-                if found.left_out is None:
-                    done.add(row)
-                else:
-                    checked.left_out.append((name, found.left_out))
-                if found.differing:
-                    differing = ", ".join(found.differing)
-                    checked.wrong.append((name, f"computed again, it has other results: {differing}"))
-            checked.count += 1
-            yield checked
-    except Busy:
-        raise
-    except Exception as error:  # such as a schema without policies
-        checked.wrong.append((checked.what, _in_words(error)))
+                checked.left_out.append((name, found.left_out))
+            if found.differing:
+                checked.wrong.append((name, f"computed again, it has other results: {', '.join(found.differing)}"))
+        checked.count += 1
+        yield checked
     yield checked
 
 

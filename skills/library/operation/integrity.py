@@ -15,10 +15,10 @@ from typing import Any, TypeVar
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.changes import WeightedCache
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredPoses, StoredRecording
 from skills.db.packed import digest
 from skills.db.service_tables import StoredDataset
+from skills.db.weighted_cache import WeightedCache
 from skills.demonstration.demonstration import Demo
 from skills.errors import AmbiguousDigest, Corrupt, NotFound
 from skills.gridworld.grid import GridPath

@@ -19,17 +19,19 @@ from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import now, rfc3339
+from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
 from skills.library.operation import locks
 from skills.library.people.consent import require
-from skills.library.policies.releases import Outcome, is_served
+from skills.library.policies.releases import Outcome, is_served, outcomes_of
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
+from skills.schemas.operation import Job as JobAnswer
+from skills.schemas.operation import ServedNow
 
 BATCH, PART = "retraining", "retraining-part"
 EXPORT, PICTURES = "dataset", "pictures"
@@ -40,7 +42,7 @@ UNSYNCHRONISED: Any = {"execution_options": {"synchronize_session": False}}
 Rows = Sequence[int] | Select[int]  # at most as many as a statement may have parameters, or a query
 
 
-def to_tell(session: Session, job: Job) -> list[tuple[int, int]]:
+def attempts_to_submit(session: Session, job: Job) -> list[tuple[int, int]]:
     """List the rows and attempts to submit to the engine for a job: its own, or those of a batch's parts."""
     if job.kind != BATCH:
         return [(job.row, job.attempt)]
@@ -115,7 +117,7 @@ def settle(session: Session, batch: int) -> None:
     if counted["queued"]:
         return
     # A batch to whose styles others are still added has not ended.
-    complete = Job.told_at.is_not(None)
+    complete = Job.submitted_at.is_not(None)
     state = "failed" if counted["failed"] else "cancelled" if counted["cancelled"] else "succeeded"
     ended = {"state": state, "progress": 1.0, "result": counted, "error": _why(counted), "ended_at": now()}
     # Only the transaction that changes the state records the event.
@@ -256,7 +258,7 @@ def ask(
         request={**request},
         plan=request.get("plan"),
         surgeon_row=surgeon.row if surgeon else None,
-        asked_by=actor,
+        requested_by=actor,
     )
     session.add(job)
     session.flush()
@@ -268,7 +270,7 @@ def find_live(session: Session, kind: str, request: Mapping[str, object]) -> Job
     """Return the job of an equal request that is queued, running or done, even if the caller may not see it."""
     alike = select(Job).where(Job.identity == identity_of(kind, request), Job.state.in_(LIVE))
     # All rows, not only the caller's: an equal job must not be queued twice.
-    return session.scalar(alike.execution_options(**EVERYBODYS))
+    return session.scalar(alike.execution_options(**ALL_ROWS))
 
 
 def while_running(database: Database, row: int, attempt: int) -> Database:
@@ -291,7 +293,7 @@ def while_running(database: Database, row: int, attempt: int) -> Database:
     return database.on_condition(check, [locks.job(row)] if names is None else names)
 
 
-def telling(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
+def progress_callback(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
     """Return a callback that stores the progress of a running job, in the database of `while_running`."""
     mine = (Job.identity == identity_of(kind, request), Job.state == "running")
 
@@ -314,7 +316,7 @@ def refuse_too_many(session: Session, actor: str, most: int) -> None:
         TooMany: The limit is reached.
     """
     # Parts are left out, because their batch counts as one.
-    mine = select(func.count()).where(Job.asked_by == actor, Job.state.in_(ACTIVE), Job.kind != PART)
+    mine = select(func.count()).where(Job.requested_by == actor, Job.state.in_(ACTIVE), Job.kind != PART)
     waiting = session.scalar(mine.select_from(Job)) or 0
     if waiting >= most:
         raise TooMany(
@@ -404,19 +406,29 @@ def cancel(session: Session, job_id: str, actor: str) -> Job:
     return job
 
 
-def job_json(row: Job, outcome: Outcome, did: str | None = None) -> dict[str, Any]:
-    """Return a job's JSON, with its outcome and the effect of the request that it answers."""
-    return {
-        "id": row.id,
-        "kind": row.kind,
-        "state": row.state,
-        "progress": row.progress,
-        "request": row.request,
-        "result": outcome.result,
-        "served": outcome.served,
-        "did": did,
-        "error": row.error,
-        "created_at": rfc3339(row.created_at),
-        "started_at": rfc3339(row.started_at),
-        "ended_at": rfc3339(row.ended_at),
-    }
+def describe_jobs(session: Session, jobs: Sequence[Job]) -> list[JobAnswer]:
+    """Return jobs with their outcomes, as the API answers."""
+    outcomes = outcomes_of(session, jobs)
+    return [_answer(job, outcomes[job.row], None) for job in jobs]
+
+
+def describe_job(session: Session, job: Job, did: str | None = None) -> JobAnswer:
+    """Return a job with its outcome and the effect of the request that it answers."""
+    return _answer(job, outcomes_of(session, [job])[job.row], did)
+
+
+def _answer(job: Job, outcome: Outcome, did: str | None) -> JobAnswer:
+    return JobAnswer(
+        id=job.id,
+        kind=job.kind,
+        state=job.state,
+        progress=job.progress,
+        request=job.request,
+        result=outcome.result,
+        served=None if outcome.served is None else ServedNow(**outcome.served),
+        did=did,
+        error=job.error,
+        created_at=job.created_at,
+        started_at=job.started_at,
+        ended_at=job.ended_at,
+    )

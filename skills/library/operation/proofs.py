@@ -19,15 +19,18 @@ from typing import Any
 from sqlalchemy import Connection, or_, select
 from sqlalchemy.orm import Session
 
-from skills.db import rfc3339
-from skills.db.history import CHECKPOINTS, History, newest_checkpoint
+from skills.db.history import History
+from skills.db.leaves import CHECKPOINTS, newest_checkpoint
 from skills.db.logged_rows import as_bytes, logged
 from skills.db.models import PolicyVersion, Release
 from skills.db.session import Database
 from skills.errors import Busy, NotFound
 from skills.library.operation.history import covered_leaf, logged_leaf, sign_history
 from skills.library.people.surgeons import find_surgeon
-from skills.transparency import Note, attest, read_notes
+from skills.schemas.given import LeafProof, ServedAt, SignedCheckpoint
+from skills.transparency.merkle import Checkpoint
+from skills.transparency.notes import Note, read_notes
+from skills.transparency.statements import attest
 
 DISCLOSED = {  # of the rows that a proof is about; the digests of their other columns reveal nothing without a guess
     "releases": ("row", "policy_row", "surgeon_row", "suture", "released_at", "released_by", "withdrawn_at"),
@@ -35,7 +38,7 @@ DISCLOSED = {  # of the rows that a proof is about; the digests of their other c
 }
 
 
-def checkpoint_json(connection: Connection, history: History) -> dict[str, Any]:
+def signed_checkpoint(connection: Connection, history: History) -> SignedCheckpoint:
     """Return the newest signed checkpoint and the public key that verifies it.
 
     Raises:
@@ -45,10 +48,10 @@ def checkpoint_json(connection: Connection, history: History) -> dict[str, Any]:
     note = newest_checkpoint(connection)
     if note is None:
         raise Busy("No history was begun yet; try again in a moment.")
-    return {"note": note, "verifier": history.key.verifier(note.partition("\n")[0])}
+    return SignedCheckpoint(note=note, verifier=history.key.verifier(note.partition("\n")[0]))
 
 
-def served_json(session: Session, history: History, surgeon: str, suture: str, at: datetime) -> dict[str, Any]:
+def served_at(session: Session, history: History, surgeon: str, suture: str, at: datetime) -> ServedAt:
     """Return the version of a style that was served at a time, with the proof of its release and of its digest.
 
     It reads a few tiles of the history, see `skills.db.tiles`, however many leaves there are.
@@ -60,54 +63,44 @@ def served_json(session: Session, history: History, surgeon: str, suture: str, a
         Corrupt: The history is not whole.
     """
     of_style = (Release.surgeon_row == find_surgeon(session, surgeon).row, Release.suture == suture)
-    standing = (Release.released_at <= at, or_(Release.withdrawn_at.is_(None), Release.withdrawn_at > at))
-    found = session.execute(
-        select(Release, PolicyVersion.sha256)
-        .join(PolicyVersion, PolicyVersion.row == Release.policy_row)
-        .where(*of_style, *standing)
-        .order_by(Release.row.desc())
-        .limit(1)
-    ).first()
+    in_force = (Release.released_at <= at, or_(Release.withdrawn_at.is_(None), Release.withdrawn_at > at))
+    query = select(Release, PolicyVersion.sha256).join(PolicyVersion, PolicyVersion.row == Release.policy_row)
+    found = session.execute(query.where(*of_style, *in_force).order_by(Release.row.desc()).limit(1)).first()
     if found is None:
         raise NotFound("No version of this style was released at that time.")
     release, sha256 = found
     connection = session.connection()
-    checkpoint = checkpoint_json(connection, history)
-    keys = {"releases": str(release.row), "policy_versions": str(release.policy_row)}
-    return {
-        "surgeon": surgeon,
-        "suture": suture,
-        "at": rfc3339(at),
-        "policy": sha256,
-        "released_at": rfc3339(release.released_at),
-        "withdrawn_at": rfc3339(release.withdrawn_at),
-        "proofs": _proofs(connection, history, keys, checkpoint["note"]),
-        "checkpoint": checkpoint,
-    }
+    checkpoint = signed_checkpoint(connection, history)
+    signed = read_notes(checkpoint.note)[0].checkpoint
+    rows = (("releases", release.row), ("policy_versions", release.policy_row))
+    return ServedAt(
+        surgeon=surgeon,
+        suture=suture,
+        at=at,
+        policy=sha256,
+        released_at=release.released_at,
+        withdrawn_at=release.withdrawn_at,
+        proofs=[_proof(connection, history, table, str(row), signed) for table, row in rows],
+        checkpoint=checkpoint,
+    )
 
 
-def _proofs(connection: Connection, history: History, keys: dict[str, str], note: str) -> list[dict[str, Any]]:
-    """Return the proofs of the newest leaves of some rows, given by table and key."""
-    leaves = {table: logged_leaf(connection, history, table, key) for table, key in keys.items()}
-    signed = read_notes(note)[0].checkpoint
-    proofs = []
-    for table, latest in leaves.items():
-        if latest.number is None or latest.number >= signed.size:
-            raise Busy("The history is not signed up to this release yet; try again in a second.")
-        (row,) = logged()[table].rows_of(connection, [keys[table]])
-        disclosed = [name for name in DISCLOSED[table] if name in latest.digests]  # a leaf of before an added column
-        proofs.append(
-            {
-                "table": table,
-                "number": latest.number,
-                "entry": latest.entry,
-                "salt": latest.salt.hex(),
-                "disclosed": {name: as_bytes(getattr(row, name))[1:].decode() for name in disclosed},
-                "digests": dict(latest.digests),
-                "hashes": [one.hex() for one in covered_leaf(connection, latest, signed)],
-            }
-        )
-    return proofs
+def _proof(connection: Connection, history: History, table: str, key: str, signed: Checkpoint) -> LeafProof:
+    """Return the proof of a row's newest leaf under a checkpoint."""
+    leaf = logged_leaf(connection, history, table, key)
+    if leaf.number is None or leaf.number >= signed.size:
+        raise Busy("The history is not signed up to this release yet; try again in a second.")
+    (row,) = logged()[table].rows_of(connection, [key])
+    disclosed = [name for name in DISCLOSED[table] if name in leaf.digests]  # a leaf of before an added column
+    return LeafProof(
+        table=table,
+        number=leaf.number,
+        entry=leaf.entry,
+        salt=leaf.salt.hex(),
+        disclosed={name: as_bytes(getattr(row, name))[1:].decode() for name in disclosed},
+        digests=dict(leaf.digests),
+        hashes=[one.hex() for one in covered_leaf(connection, leaf, signed)],
+    )
 
 
 Rows = Sequence[tuple[str, int]]  # a table, and the key of a row in it

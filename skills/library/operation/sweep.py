@@ -32,7 +32,7 @@ from skills.db.models import (
     StoredPlayback,
     StoredRecording,
 )
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.library.operation import locks
@@ -152,7 +152,7 @@ def _sweep_chunks(database: Database) -> bool:
             return False
         of = RecordingChunk
         some = select(of.number).where(of.recording == row).order_by(of.number).limit(at_once)
-        numbers = session.scalars(some, execution_options=EVERYBODYS).all()
+        numbers = session.scalars(some, execution_options=ALL_ROWS).all()
         session.execute(delete(of).where(of.recording == row, of.number.in_(numbers)), **UNSYNCHRONISED)
         if len(numbers) < at_once:
             session.execute(delete(LooseChunks).where(LooseChunks.recording_row == row), **UNSYNCHRONISED)
@@ -193,7 +193,7 @@ def _jobs_of(surgeon_row: int) -> Select[int]:
 def _fail_undivided(database: Database) -> None:
     """Fail the batches to which nobody adds styles any more."""
     long_ago = now() - timedelta(seconds=UNDIVIDED_S)
-    waiting = (Job.kind == BATCH, Job.state.in_(ACTIVE), Job.told_at.is_(None), Job.created_at < long_ago)
+    waiting = (Job.kind == BATCH, Job.state.in_(ACTIVE), Job.submitted_at.is_(None), Job.created_at < long_ago)
     with database.reading() as session:
         rows = session.scalars(select(Job.row).where(*waiting)).all()
     for row in rows:

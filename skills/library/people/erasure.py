@@ -40,7 +40,7 @@ from skills.db.models import (
     StoredRewardMap,
     Surgeon,
 )
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import Job, record_event
 from skills.errors import Conflict, NotAllowed
 from skills.library.operation.jobs import ACTIVE as NOT_ENDED
@@ -152,7 +152,7 @@ def _drop_exports(session: Session, which: ColumnElement[bool], surgeon: Surgeon
             theirs = select(of.recording_row).where(of.surgeon_row == surgeon.row)
             rows |= {*session.scalars(exports_from(theirs))}
     found = select(Job.row, Job.attempt).where(Job.row.in_(rows), ACTIVE)
-    dropped = [(row, at) for row, at in session.execute(found.execution_options(**EVERYBODYS))]
+    dropped = [(row, at) for row, at in session.execute(found.execution_options(**ALL_ROWS))]
     drop_exports(session, sorted(rows))
     return dropped
 
@@ -193,7 +193,7 @@ def deletable_recording(
         raise NotAllowed("Another user uploaded this recording; that user or an admin can delete it.")
     resting = select(func.count()).select_from(Demonstration).where(Demonstration.recording_row == stored.row)
     # The count covers all surgeons: a restricted key must not delete bytes under demonstrations that it cannot see.
-    if session.scalar(resting.execution_options(**EVERYBODYS)):
+    if session.scalar(resting.execution_options(**ALL_ROWS)):
         why = "Demonstrations, active or withdrawn, depend on this recording."
         raise Conflict(why, Remedy(Action.ERASE_DEMOS))
     return stored, anybodys or senders == {actor}
@@ -259,7 +259,7 @@ def _delete_recordings(session: Session, rows: Sequence[int]) -> None:
     The bytes of many or large ones are left to the sweep.
     """
     size = select(func.coalesce(func.sum(StoredRecording.size_bytes), 0)).where(StoredRecording.row.in_(rows))
-    if (session.scalar(size.execution_options(**EVERYBODYS)) or 0) <= AT_ONCE_BYTES:
+    if (session.scalar(size.execution_options(**ALL_ROWS)) or 0) <= AT_ONCE_BYTES:
         session.execute(delete(RecordingChunk).where(RecordingChunk.recording.in_(rows)), **UNSYNCHRONISED)
     else:
         session.add_all(LooseChunks(recording_row=row, due_at=now()) for row in rows)

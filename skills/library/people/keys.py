@@ -25,7 +25,8 @@ from sqlalchemy import delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from skills.db import now
-from skills.db.history import HISTORY, LEAVES
+from skills.db.history import HISTORY
+from skills.db.leaves import LEAVES
 from skills.db.row_visibility import Only
 from skills.db.service_tables import Key, KeySurgeon, SignIn, record_event
 from skills.errors import BadInput, Conflict, NotFound

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from skills.db import in_parts
 from skills.db.models import Demonstration, ErasedInterval, RecordingSurgeon, StoredRecording, Surgeon
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.session import Database
 from skills.errors import Conflict
 from skills.formats.parsed import ParsedContent
@@ -104,7 +104,7 @@ def recorded_in(session: Session, episodes: Episodes) -> SurgeonsRecorded:
     found = {row for one in episodes for query in _recorded(one) for row in session.scalars(query.distinct())}
     rows = sorted(found - {None})
     of = (select(Surgeon).where(Surgeon.row.in_(some)).order_by(Surgeon.row) for some in in_parts(rows))
-    surgeons = [one for query in of for one in session.scalars(query, execution_options=EVERYBODYS)]
+    surgeons = [one for query in of for one in session.scalars(query, execution_options=ALL_ROWS)]
     return SurgeonsRecorded(surgeons, None in found)
 
 

@@ -53,7 +53,7 @@ from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
-from skills.transparency import Note
+from skills.transparency.notes import Note
 from skills.verification.arm_errors import ArmErrors
 
 POINTS = 1000  # ours, for either path: one every 0.25 mm of a long pass, and 24 MB to align the two

@@ -100,7 +100,7 @@ def perform_try(database: Database, request: dict[str, Any], settings: Settings)
     asked = TryIn.model_validate({name: value for name, value in request.items() if name != "again"})
     mine = Job.identity == identity_of(TRY, request), Job.state == "running"
     with database.reading() as session:
-        actor = session.scalar(select(Job.asked_by).where(*mine)) or ""
+        actor = session.scalar(select(Job.requested_by).where(*mine)) or ""
     told: list[dict[str, Any]] = []
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if the recording is not cached

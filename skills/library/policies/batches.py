@@ -143,7 +143,7 @@ class _Batch:
     row: int
     part: int
     request: RetrainingRequest
-    asked_by: str
+    requested_by: str
     settings: Settings
     tell: Parser
 
@@ -179,7 +179,7 @@ def retrain_part(database: Database, request: PartRequest, settings: Settings) -
     with database.reading() as session:
         job = session.get_one(Job, request["retraining"])
         shared = cast(RetrainingRequest, job.request)
-        batch = _Batch(job.row, request["part"], shared, job.asked_by, settings, reader.parse)
+        batch = _Batch(job.row, request["part"], shared, job.requested_by, settings, reader.parse)
     with AT_WORK, closing(reader.server):  # it starts only if a recording is not cached
         _train_all(database, batch)
 
@@ -402,7 +402,7 @@ def _kept(
         served = measured.served
         comparison = compare(figures(served.version, served.sha256, served.manifest), trained, measured.fit)
     if batch.request["release"]:
-        comparison = _release(session, stored.row, comparison, batch.asked_by)
+        comparison = _release(session, stored.row, comparison, batch.requested_by)
     written: dict[str, Any] = as_json(comparison)
     return written
 

@@ -65,7 +65,7 @@ from skills.schemas.cards import (
     TipErrors,
 )
 from skills.schemas.people import SutureType
-from skills.transparency import Note
+from skills.transparency.notes import Note
 from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
 FORMAT = 1  # of the JSON: raise it when a field is removed or changes its meaning

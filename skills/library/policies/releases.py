@@ -42,7 +42,8 @@ from sqlalchemy.orm import Session, aliased
 from skills.arrays import Floats
 from skills.db import now, rfc3339
 from skills.db.changes import announce
-from skills.db.history import HISTORY, LEAVES
+from skills.db.history import HISTORY
+from skills.db.leaves import LEAVES
 from skills.db.models import (
     Demonstration,
     PolicyVersion,

@@ -96,7 +96,7 @@ def request_retraining(
                 break  # cancelled or erased meanwhile
             _divide(session, job, styles[first : first + at_once], size)
     with database.writing([locks.job(job.row)]) as session:
-        session.execute(update(Job).where(Job.row == job.row).values(told_at=now()), **jobs.UNSYNCHRONISED)
+        session.execute(update(Job).where(Job.row == job.row).values(submitted_at=now()), **jobs.UNSYNCHRONISED)
         jobs.settle(session, job.row)  # a batch without styles, or whose styles are all done, ends here
         told = session.get(Job, job.row)
     if told is None:
@@ -287,7 +287,7 @@ def _new_part(job: Job) -> Job:
         identity=jobs.identity_of(PART, {"retraining": job.id, "part": name}),
         request={},
         surgeon_row=job.surgeon_row,
-        asked_by=job.asked_by,
+        requested_by=job.requested_by,
     )
 
 

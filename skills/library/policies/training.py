@@ -315,7 +315,7 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
     with closing(reader.server):  # it starts only if a recording is not cached
         found = with_partners(database, found, reader.parse)
     lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
-    learnt = learn_style(lesson, request, settings, jobs.telling(database, "training", request))
+    learnt = learn_style(lesson, request, settings, jobs.progress_callback(database, "training", request))
 
     def store(session: Session, actor: str) -> dict[str, Any]:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)

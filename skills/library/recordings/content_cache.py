@@ -23,8 +23,7 @@ from sqlalchemy.orm import Session
 
 from skills import packing
 from skills.db.models import AT_ONCE_BYTES, CHUNK_BYTES, ParsedChunk, ParsedRecording, StoredRecording
-from skills.db.packed import load_arrays
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.session import Database
 from skills.errors import Busy, Corrupt
 from skills.formats.parsed import ParsedContent
@@ -147,7 +146,7 @@ def _add_missing(session: Session, recording_row: int, entry: Entry, start: int)
 
 def is_cached(session: Session, stored: StoredRecording) -> bool:
     """Return whether a recording has an entry of this version and of its reading parameters."""
-    row = session.get(ParsedRecording, stored.row, execution_options=EVERYBODYS)
+    row = session.get(ParsedRecording, stored.row, execution_options=ALL_ROWS)
     return row is not None and (row.version, row.reading) == (READER_VERSION, _digest_of(stored.reading))
 
 
@@ -174,7 +173,7 @@ def read_entry(session: Session, stored: StoredRecording) -> ParsedContent:
     if _seal(stored.sha256, row.reading, data) != row.sha256:
         raise Corrupt("The entry does not match its digest and is not used; the recording's bytes are decoded instead.")
     try:
-        parsed = packing.assemble(load_arrays(data), KNOWN)
+        parsed = packing.read(io.BytesIO(data), KNOWN)
         if not isinstance(parsed, ParsedContent):
             raise TypeError(type(parsed).__name__)
     except Exception as error:  # of any class: its values are refused, or their form is unknown

@@ -311,7 +311,7 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         split_by=request["split"],
         export=export,
     )
-    tell = jobs.telling(database, EXPORT, request)
+    tell = jobs.progress_callback(database, EXPORT, request)
     with ExitStack() as opened:
         file = opened.enter_context(TemporaryFile())
         read = confined_reader(settings)

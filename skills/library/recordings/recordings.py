@@ -27,7 +27,7 @@ from skills.db.models import (
     RecordingUpload,
     StoredRecording,
 )
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
@@ -219,7 +219,7 @@ def send_ahead(database: Database, upload: Upload) -> int | None:
         return None
     same = select(StoredRecording.row).where(StoredRecording.sha256 == upload.sha256)
     with database.reading() as session:
-        if session.scalar(same.execution_options(**EVERYBODYS)) is not None:
+        if session.scalar(same.execution_options(**ALL_ROWS)) is not None:
             return None
     with database.writing(()) as session:
         row = _reserve(session)
@@ -286,7 +286,7 @@ def put_recording(
         Conflict: The bytes are already stored with other reading parameters.
     """
     same = select(StoredRecording).where(StoredRecording.sha256 == upload.sha256)
-    stored = session.scalar(same.execution_options(**EVERYBODYS))
+    stored = session.scalar(same.execution_options(**ALL_ROWS))
     entry = None if entry is not None and entry.is_large else entry
     if stored is not None:
         if ahead is not None:  # another upload of the same bytes was faster

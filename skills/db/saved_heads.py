@@ -1,6 +1,6 @@
 """Heads of a history in a file outside its database, by which an older copy of the database is recognised.
 
-    signed checkpoint --keep_head--> file --last_head--> the head that the database must still have
+    signed checkpoint --save_head--> file --last_head--> the head that the database must still have
 
 The file is beside the signing key unless `SKILLS_CHECKPOINTS` names another: whoever can replace the database must not
 be able to write to it. Each place of a database has a file of its own, so that a copy of the database elsewhere, which
@@ -17,7 +17,7 @@ from pathlib import Path
 from sqlalchemy import URL
 
 from skills.errors import BadSettings, Corrupt, NotReady
-from skills.transparency import Note, read_notes
+from skills.transparency.notes import Note, read_notes
 
 TAIL_BYTES = 4096  # a note has some 250 bytes, and at most 1000 characters
 ANOTHER = "Name another file in SKILLS_CHECKPOINTS."
@@ -25,7 +25,7 @@ ANOTHER = "Name another file in SKILLS_CHECKPOINTS."
 log = logging.getLogger(__name__)
 
 
-def heads_beside(key_file: Path, url: URL) -> Path:
+def heads_file_for(key_file: Path, url: URL) -> Path:
     """Return the file for the heads of the database at a URL, beside a signing key."""
     if url.get_backend_name() == "sqlite":
         place = str(Path(url.database or "").resolve())
@@ -59,7 +59,7 @@ def last_head(file: Path) -> Note | None:
         ) from error
 
 
-def keep_head(file: Path, note: str) -> None:
+def save_head(file: Path, note: str) -> None:
     """Append a signed checkpoint to a file, durably, unless the file ends in a later one of the same history.
 
     A failure is logged, because the next checkpoint will do as well.
@@ -80,7 +80,7 @@ def keep_head(file: Path, note: str) -> None:
         log.error("The head of the history could not be appended to %s (%s). %s", file, error, ANOTHER)
 
 
-def set_aside(file: Path) -> None:
+def archive_heads(file: Path) -> None:
     """Rename a file of kept heads, so that the next head begins a new one; the old one stays as evidence.
 
     Raises:

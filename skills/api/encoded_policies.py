@@ -1,0 +1,113 @@
+"""Encoded responses of policies, cached under the digest of the policy and the identity of its release."""
+
+import re
+from collections.abc import Collection
+from functools import lru_cache
+
+import orjson
+
+from skills.api.responses import JSON, Body, tag_of
+from skills.db.history import History
+from skills.db.models import PolicyVersion, Release
+from skills.db.weighted_cache import WeightedCache
+from skills.errors import UnknownFormat
+from skills.library.operation.proofs import sign_files
+from skills.library.policies import versions
+from skills.library.policies.versions import Served, has_poses, pose_style_json, poses_of
+from skills.settings import MEBIBYTE
+from skills.transparency.notes import Note
+
+NPZ = "application/x-npz"
+GIVEN_FOR = {NPZ: NPZ, JSON: JSON, "application/*": JSON, "*/*": JSON}
+WEIGHT = re.compile(r";\s*q=(0(?:\.\d{0,3})?|1(?:\.0{0,3})?)\s*$")
+KEPT_BYTES = 64 * MEBIBYTE  # capacity of the cache; a policy's JSON is about 50 kB, with a million actions 3 MB
+
+
+@lru_cache(256)
+def negotiate(accept: str) -> str:
+    """Choose between JSON and arrays: the media type with the highest weight, and of equal weights the first.
+
+    Raises:
+        UnknownFormat: The client accepts neither.
+    """
+    chosen, most = None, 0.0
+    for part in accept.lower().split(","):
+        given = GIVEN_FOR.get(part.partition(";")[0].strip())
+        weight = WEIGHT.search(part)
+        weighs = float(weight[1]) if weight else 1.0
+        if given is not None and weighs > most:
+            chosen, most = given, weighs
+    if chosen is None:
+        raise UnknownFormat(f"A policy is available as {JSON} or {NPZ}; name one of them in Accept.")
+    return chosen
+
+
+class Encoded:
+    """LRU cache of encoded policy responses, keyed by everything that their content depends on."""
+
+    def __init__(self) -> None:
+        self._kept: WeightedCache[tuple[object, ...], Body] = WeightedCache(KEPT_BYTES, lambda body: len(body.content))
+
+    def policy(self, policy: PolicyVersion, release: Release | None, accept: str) -> Body:
+        """Return the encoded response of a policy version and its release, from the cache if it is there."""
+        media_type = negotiate(accept)
+        # With their times, because row and version numbers are used again after an erasure.
+        released = (release.row, release.released_at) if release else None
+        poses = policy.poses.sha256 if policy.poses else None
+        key = (policy.sha256, policy.version, policy.created_at, released, poses, media_type)
+        body = self._kept.get(key)
+        if body is None:
+            body = _encode(policy, release, media_type)
+            self._kept.put(key, body)
+        return body
+
+    def pose_style(self, policy: PolicyVersion) -> Body:
+        """Return the encoded pose style of a policy version, from the cache if it is there."""
+        key = (policy.sha256, policy.version, policy.created_at, policy.poses.sha256 if policy.poses else None)
+        body = self._kept.get(key)
+        if body is None:
+            content = orjson.dumps(pose_style_json(policy, poses_of(policy)))
+            body = Body(content, JSON, tag_of(content))
+            self._kept.put(key, body)
+        return body
+
+    def signature(self, served: Served, head: Note, history: History) -> Body:
+        """Return the signature of the responses of a released policy, each as it is sent; they are encoded for it.
+
+        Args:
+            served: The policy and its release.
+            head: A checkpoint of the history that covers both.
+            history: The history, with the key.
+        """
+        policy, release = served.policy, served.release
+        bodies = {
+            "policy.json": self.policy(policy, release, JSON),
+            "policy-version.json": self.policy(policy, None, JSON),
+            "policy.npz": self.policy(policy, release, NPZ),
+        }
+        if has_poses(policy):
+            bodies["pose-style.json"] = self.pose_style(policy)
+        digests = {name: body.etag.strip('"') for name, body in bodies.items()}
+        facts = {"surgeon": policy.surgeon.slug, "suture": policy.suture, "version": policy.version}
+        content = sign_files(history, head, digests, kind="policy", policy=policy.sha256, **facts)
+        return Body(content, JSON, tag_of(content))
+
+    def policies(self) -> set[str]:
+        """Return the digests of the policies with cached responses."""
+        return {str(key[0]) for key, _ in self._kept.items()}
+
+    def forget(self, policies: Collection[str]) -> None:
+        """Remove the cached responses of these policies."""
+        self._kept.forget([key for key, _ in self._kept.items() if key[0] in policies])
+
+
+def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> Body:
+    if media_type == NPZ:
+        content = versions.arrays_of(policy)
+    else:
+        arrays = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
+        content = orjson.dumps(versions.policy_json(policy, release) | {"arrays": arrays})
+    # A header and no field: the bytes, and so the ETag and what older clients verify, stay those of the policy.
+    linked = release is not None and policy.poses is not None
+    link = f'<{policy.suture}/pose-style>; rel="related"; title="pose style"' if linked else None
+    return Body(content, media_type, tag_of(content), link)

@@ -1,0 +1,127 @@
+"""Filters of the templates: numbers, times and states as text, and the thumbnail of a style."""
+
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from functools import lru_cache
+from math import degrees
+from typing import Any
+
+from skills.library.operation.styles import StyleState
+from skills.library.plans.playbacks import error_called
+
+MISSING = "–"
+STATE_MARKS = {"released": "●", "trained": "◐", "stored": "○", "empty": "·"}
+JOB_MARKS = {"queued": "○", "running": "◐", "succeeded": "●", "failed": "✕", "cancelled": "–", "done": "●"}
+STATE_WORDS = {
+    "released": "served to clients",
+    "trained": "learnt, not released",
+    "stored": "demonstrated, not learnt",
+    "empty": "nothing yet",
+}
+
+
+def number(value: float | None, unit: str = "", digits: int = 2) -> str:
+    """Return a number with its unit, rounded, and without a fraction if that is 0."""
+    if value is None:
+        return MISSING
+    text = f"{value:,.{digits}f}" if isinstance(value, float) else f"{value:,}"
+    if "." in text:
+        text = text.rstrip("0").rstrip(".")
+    return f"{text} {unit}".strip()
+
+
+def triple(values: Sequence[float] | None, unit: str = "mm", digits: int = 2) -> str:
+    """Return the coordinates x, y and z with their unit."""
+    if values is None:
+        return MISSING
+    return ", ".join(f"{value:.{digits}f}" for value in values) + f" {unit}"
+
+
+def moment(value: datetime | str | None) -> str:
+    """Return a time in UTC, to the second."""
+    if value is None:
+        return MISSING
+    seen = datetime.fromisoformat(value) if isinstance(value, str) else value
+    return seen.replace(tzinfo=seen.tzinfo or UTC).astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def short(digest: str) -> str:
+    """Return the first 12 characters of a digest, enough to distinguish it from the others on a page."""
+    return digest[:12]
+
+
+def size(count: int) -> str:
+    """Return a number of bytes with a unit."""
+    for unit, scale in (("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if count >= scale:
+            return f"{count / scale:.1f} {unit}"
+    return f"{count} bytes"
+
+
+def share(value: float | None, digits: int = 1) -> str:
+    """Return a fraction as percent; less than all is never rounded to 100 %."""
+    if value is None:
+        return MISSING
+    text = f"{100 * value:.{digits}f}"
+    if value < 1 and float(text) >= 100:
+        return f"> {100 - 10**-digits:.{digits}f} %"
+    return f"{text} %"
+
+
+def outline(style: StyleState) -> dict[str, Any] | None:
+    """Return the drawing of a style as a thumbnail: its path in the box of its grid, in a square of 100 by 100 units.
+
+    The view is orthographic, from above one corner. None if there is nothing to draw.
+    """
+    if style.shown is None:
+        return None
+    nx, ny, nz = style.shown.grid_shape
+    seen, box = _box(nx, ny, nz)
+    path = [seen(at // (ny * nz), at // nz % ny, at % nz) for at in style.shown.waypoints]
+    return {**box, "path": _line(path), "start": path[0], "goal": path[-1]}
+
+
+Seen = tuple[float, float]  # a point in the square
+
+
+@lru_cache(maxsize=1000)
+def _box(nx: int, ny: int, nz: int) -> tuple[Callable[[int, int, int], Seen], dict[str, str]]:
+    """Return where a cell of a grid of this shape is seen, and the lines of the grid's box; many styles share them."""
+    x, y, z = ends = nx - 1, ny - 1, nz - 1
+    across = [(0.94, -0.34, 0.0), (0.14, 0.40, 0.91)]  # screen axes: turned by 20 degrees, seen from 25 degrees above
+    low = [sum(min(0, part * end) for part, end in zip(axis, ends, strict=True)) for axis in across]
+    high = [sum(max(0, part * end) for part, end in zip(axis, ends, strict=True)) for axis in across]
+    scale = 92 / max(high[0] - low[0], high[1] - low[1], 1)
+    (ux, uy, uz), (vx, vy, vz) = across
+    middle_u, middle_v = ((below + above) / 2 for below, above in zip(low, high, strict=True))
+
+    def seen(i: int, j: int, k: int) -> Seen:
+        u, v = ux * i + uy * j + uz * k, vx * i + vy * j + vz * k
+        return round(50 + scale * (u - middle_u), 1), round(50 - scale * (v - middle_v), 1)
+
+    lines = {
+        "floor": [(0, 0, 0), (x, 0, 0), (x, y, 0), (0, y, 0), (0, 0, 0)],
+        "back": [(0, y, 0), (0, y, z), (x, y, z), (x, 0, z), (x, 0, 0)],
+        "spine": [(x, y, 0), (x, y, z)],
+    }
+    return seen, {name: _line([seen(*cell) for cell in cells]) for name, cells in lines.items()}
+
+
+def _line(points: Sequence[Seen]) -> str:
+    return " ".join(f"{u},{v}" for u, v in points)
+
+
+FILTERS = {
+    "number": number,
+    "triple": triple,
+    "moment": moment,
+    "short": short,
+    "size": size,
+    "share": share,
+    "degrees": degrees,
+    "outline": outline,
+    "state_mark": STATE_MARKS.__getitem__,
+    "error_called": error_called,
+    "state_words": STATE_WORDS.__getitem__,
+    "job_mark": JOB_MARKS.__getitem__,
+}
