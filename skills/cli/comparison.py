@@ -291,7 +291,7 @@ def calibrate(
     better than chance and than the duration alone.
     """
     from skills.db.session import Database
-    from skills.library.comparison.calibrations import calibrate_on, keep, read_cohort
+    from skills.library.comparison.calibrations import accepted, calibrate_on, put_calibration, read_cohort
     from skills.scoring.validation import check_permutations
     from skills.serving import prepare
     from skills.settings import settings
@@ -299,26 +299,27 @@ def calibrate(
     check_permutations(permutations)
     prepare(settings())
     with err.status("reading") as status:
-        rated = read_cohort(folder, tasks=task or (), told=lambda share: status.update(f"reading {share:.0%}"))
+        rated = read_cohort(folder, tasks=task or (), progress=lambda share: status.update(f"reading {share:.0%}"))
         _tell_left_out(rated.left_out)
-        about = calibrate_on(
+        calibration = calibrate_on(
             rated,
             seed=seed,
             permutations=permutations,
-            told=lambda share: status.update(f"measuring the chance level {share:.0%}"),
+            progress=lambda share: status.update(f"measuring the chance level {share:.0%}"),
         )
+    about = calibration.model_dump(mode="json")
     if not as_json:
         _tell_judged(about)
     sha256 = None
     try:
         with closing(Database(settings().database_url)) as database, database.writing() as session:
-            stored, _ = keep(session, about, "local")
+            stored, _ = put_calibration(session, calibration, "local")
             sha256 = stored.sha256
     finally:
         if as_json:  # the figures of a refused model too, without a digest
             print_json({"sha256": sha256, **about})
     if not as_json:
-        _tell_model(about)
+        _tell_model(about, accepted(calibration))
         out.print(f"Stored, and used by every score from now on: {sha256}", soft_wrap=True)
 
 
@@ -377,16 +378,15 @@ def _tell_task(judged: dict[str, Any]) -> None:
     out.print(f"Its rho with the parts of the rating: {parts}", soft_wrap=True)
 
 
-def _tell_model(about: dict[str, Any]) -> None:
+def _tell_model(about: dict[str, Any], used: list[str]) -> None:
     """Print the weights of each task, and which tasks are rated."""
     from rich.table import Table
 
-    from skills.library.comparison.calibrations import accepted
     from skills.scoring.calibration import from_numbers
     from skills.scoring.features import TRIAL_KIND_OF
     from skills.scoring.validation import level_refusals, refusals
 
-    model, used = from_numbers(about["model"]), accepted(about)
+    model = from_numbers(about["model"])
     for task, name in enumerate(model.tasks):
         judged = about["validated"]["tasks"][name]
         if name not in used:

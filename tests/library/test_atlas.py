@@ -15,7 +15,7 @@ from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import dtw
-from skills.library.comparison import atlas, measured
+from skills.library.comparison import atlas, measuring
 from skills.library.comparison.atlas import atlas_of
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
@@ -43,13 +43,13 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
 def measured(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list that records how many pairs each call measures."""
     counted: list[int] = []
-    really = atlas.distances_of
+    really = measuring.distances_of
 
     def count(shapes, pairs):
         counted.append(len(pairs))
         return really(shapes, pairs)
 
-    monkeypatch.setattr(measured, "distances_of", count)
+    monkeypatch.setattr(measuring, "distances_of", count)
     return counted
 
 
@@ -162,7 +162,7 @@ def test_the_shape_cache_may_be_dropped_and_other_versions_are_ignored(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     assert atlas_of(database, SUTURE) == first
-    monkeypatch.setattr(measured, "VERSION", 0)
+    monkeypatch.setattr(measuring, "VERSION", 0)
     assert atlas_of(database, SUTURE) == first
     assert measured == [6, 6] * 3
     with database.reading() as session:
@@ -178,8 +178,8 @@ def test_it_is_measured_in_blocks_and_kept_block_by_block(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     measured.clear()
-    monkeypatch.setattr(measured, "PAIRS_AT_ONCE", 10)
-    monkeypatch.setattr(measured, "DEMOS_AT_ONCE", 2)
+    monkeypatch.setattr(measuring, "PAIRS_AT_ONCE", 10)
+    monkeypatch.setattr(measuring, "DEMOS_AT_ONCE", 2)
     assert atlas_of(database, SUTURE) == whole
     assert sum(measured) == 2 * 36 and len(measured) > 4
 
@@ -359,7 +359,7 @@ def test_erasure_leaves_nothing(database: Database, whole: bool):
 
 def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, monkeypatch: pytest.MonkeyPatch):
     names = small(database)
-    really = atlas.distances_of
+    really = measuring.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -367,7 +367,7 @@ def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, mon
                 erase_surgeon(session, cohorts.name(0), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(measured, "distances_of", erase_first)
+    monkeypatch.setattr(measuring, "distances_of", erase_first)
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names[2:]
     with database.reading() as session:
         there = {*session.scalars(select(Demonstration.row))}

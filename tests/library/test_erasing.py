@@ -15,7 +15,7 @@ from skills.db.models import Demonstration, MeasuredShape, PolicyVersion, Record
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import Conflict, NotAllowed, NotFound
-from skills.library.comparison import measured
+from skills.library.comparison import measuring
 from skills.library.comparison.atlas import atlas_of
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.operation import sweep
@@ -53,7 +53,7 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
     atlas_of(database, cases.SUTURE)  # the first now has a distance from the third
     agrees(1, ["atlas"])
     agrees(2, [])
-    really = atlas.distances_of
+    really = measuring.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -61,13 +61,13 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
                 erase_surgeon(session, cohorts.name(2), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(measured, "distances_of", erase_first)
+    monkeypatch.setattr(measuring, "distances_of", erase_first)
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         there = set(session.scalars(select(Demonstration.row)))
         kept = session.scalars(select(MeasuredShape)).all()
     assert {row for one in kept for row in one.measured.others.tolist()} <= there
-    monkeypatch.setattr(measured, "distances_of", really)
+    monkeypatch.setattr(measuring, "distances_of", really)
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         assert len(session.scalars(select(MeasuredShape)).all()) == 2
