@@ -13,7 +13,7 @@ erasure. It is meant for self-directed learning; it is not an examination.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from sqlalchemy import select
@@ -64,15 +64,6 @@ class Other:
     row: Demonstration
     numbers: Numbers
     distance_mm: float
-
-
-@dataclass
-class _Level:
-    """The demonstrations of the surgeons of one skill level."""
-
-    name: Level
-    numbers: list[Numbers] = field(default_factory=list)
-    surgeons: set[int] = field(default_factory=set)
 
 
 def others_of(
@@ -131,36 +122,27 @@ def _shapes(session: Session, rows: Sequence[int]) -> dict[int, Floats]:
 def percentiles(
     others: Sequence[Other], mine: Numbers, scored: Demonstration | None, reference: Demonstration
 ) -> list[Percentiles]:
-    """Return the percentiles of a motion's figures among the demonstrations of each skill level."""
-    return [_percentile(level, mine) for level in _by_level(others, scored, reference)]
-
-
-def _by_level(others: Sequence[Other], scored: Demonstration | None, reference: Demonstration) -> list[_Level]:
-    """Group demonstrations by the skill level of their surgeons.
+    """Return the percentiles of a motion's figures among the demonstrations of each skill level.
 
     The scored one and the reference are left out, and all that are marked recovery or failure: a level is represented
     by what is not known to have failed. The curve of a surgeon has them all.
     """
-    levels: dict[str | None, _Level] = {name: _Level(name) for name in LEVELS}
     out = {reference.row, *([scored.row] if scored else [])}
-    for other in others:
-        level = levels.get(other.row.surgeon.skill_level)
-        if level is not None and other.row.row not in out and not other.row.failed:
-            level.numbers.append(other.numbers)
-            level.surgeons.add(other.row.surgeon_row)
-    return list(levels.values())
+    counted = [one for one in others if one.row.row not in out and not one.row.failed]
+    return [
+        _percentile(level, [one for one in counted if one.row.surgeon.skill_level == level], mine) for level in LEVELS
+    ]
 
 
-def _percentile(level: _Level, mine: Numbers) -> Percentiles:
+def _percentile(level: Level, some: Sequence[Other], mine: Numbers) -> Percentiles:
     """Return the share of a level's demonstrations with a smaller value, for each figure; equal values count half."""
     reason, below = None, None
-    if len(level.numbers) < LEAST_DEMOS or len(level.surgeons) < LEAST_SURGEONS:
+    surgeons = {one.row.surgeon_row for one in some}
+    if len(some) < LEAST_DEMOS or len(surgeons) < LEAST_SURGEONS:
         reason = f"at least {LEAST_DEMOS} demonstrations of {LEAST_SURGEONS} surgeons are needed"
     else:
-        below = {name: _share_below(mine[name], [one[name] for one in level.numbers]) for name in mine}
-    return Percentiles(
-        level=level.name, demos=len(level.numbers), surgeons=len(level.surgeons), reason=reason, below=below
-    )
+        below = {name: _share_below(mine[name], [one.numbers[name] for one in some]) for name in mine}
+    return Percentiles(level=level, demos=len(some), surgeons=len(surgeons), reason=reason, below=below)
 
 
 def _share_below(value: float | None, among: Sequence[float | None]) -> float | None:
