@@ -21,7 +21,7 @@ from contextlib import aclosing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from time import monotonic
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import orjson
 from anyio import CapacityLimiter, to_thread
@@ -33,8 +33,8 @@ from starlette.types import Send
 
 from skills.db.changes import Changes, WeightedCache
 from skills.db.history import History
-from skills.db.models import PolicyVersion, Release
-from skills.db.service_tables import Job
+from skills.db.models import PolicyVersion, Release, StoredRecording
+from skills.db.service_tables import Job, StoredDataset
 from skills.db.session import Database
 from skills.errors import PreconditionFailed, SkillsError, TooMany, UnknownFormat
 from skills.formats import BYTES
@@ -328,26 +328,10 @@ class Stream(StreamingResponse):
             await self._pieces.aclose()
 
 
-class StoredFile(Protocol):
-    """A row of a file that is stored in chunks."""
-
-    @property
-    def sha256(self) -> str:
-        """The digest of its bytes."""
-
-    @property
-    def size_bytes(self) -> int:
-        """Their number."""
-
-    @property
-    def media_type(self) -> str:
-        """Their media type."""
-
-
 def stored_file(
     request: Request,
     database: Database,
-    find: Callable[[Session], StoredFile],
+    find: Callable[[Session], StoredRecording | StoredDataset],
     read: Callable[[int], bytes | None],
     *,
     accept: str,

@@ -22,7 +22,8 @@ from skills.db.models import (
     StoredPlayback,
 )
 from skills.db.session import Database
-from skills.library.people.keys import Lasts, create_key, sign_in
+from skills.library.people.keys import create_key
+from skills.library.people.sign_ins import SignInLifetime, sign_in
 from skills.verification.playback import Pictures
 from tests import backends
 from tests.db.test_packed import PLAYBACK
@@ -105,7 +106,7 @@ def fill(database: Database) -> None:
         shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]), np.ones(3))
         session.add(MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))
         key, _ = create_key(session, "ada", "reader", "test", surgeons=["kestrel"])
-        sign_in(session, key.id, Lasts(60.0, 600.0))
+        sign_in(session, key.id, SignInLifetime(60.0, 600.0))
 
 
 COLUMNS = [(table, column.name) for table in FROZEN for column in Base.metadata.tables[table].columns]

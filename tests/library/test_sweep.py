@@ -23,6 +23,7 @@ from skills.db.models import (
 from skills.db.service_tables import ErasedSurgeon, Event, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Busy, NotFound
+from skills.formats.parsed import parse_recording
 from skills.library.operation import sweep
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.jobs import find_job, identity_of, list_jobs
@@ -344,7 +345,7 @@ def test_a_small_upload_needs_one_transaction(database: Database, monkeypatch: p
 def test_bytes_sent_twice_at_once_are_kept_once(database: Database, small: None):
     data = cases.hand_off()
     first, second = cases.upload(data), cases.upload(data)
-    told = recordings.parse_upload(first)
+    told = recordings.read_upload(first, parse_recording)
     ahead = [recordings.send_ahead(database, one) for one in (first, second)]
     assert None not in ahead and len(set(ahead)) == 2
     kept = []

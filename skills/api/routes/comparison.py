@@ -9,19 +9,10 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import (
-    Db,
-    Digest,
-    Parse,
-    Slug,
-    Strict,
-)
+from skills.api.dependencies import Db, Digest, Parse, Slug, Strict
 from skills.api.openapi import gives, router_of, says
 from skills.api.pages import drawings, render
-from skills.api.responses import (
-    Giving,
-    say,
-)
+from skills.api.responses import Giving, say
 from skills.api.routes.pages import PageRoute, Picked
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.comparison import scores

@@ -5,21 +5,9 @@ from functools import partial
 from fastapi import Request, Response
 
 from skills.api.authorisation import needs
-from skills.api.dependencies import (
-    Actor,
-    Db,
-    Digest,
-    Jobs,
-    Strict,
-    room_for_a_job,
-)
+from skills.api.dependencies import Actor, Db, Digest, Jobs, Strict, room_for_a_job
 from skills.api.openapi import ends, gives, gives_file, router_of, starts_job
-from skills.api.responses import (
-    Condition,
-    Giving,
-    accepted,
-    stored_file,
-)
+from skills.api.responses import Condition, Giving, accepted, stored_file
 from skills.api.routes.policies import Accept
 from skills.db.service_tables import StoredDataset
 from skills.formats import BYTES

@@ -6,27 +6,11 @@ from typing import Annotated
 from fastapi import Query, Request, Response
 
 from skills.api.authorisation import erasing_is_for_admins, needs
-from skills.api.dependencies import (
-    Actor,
-    Db,
-    Digest,
-    Incoming,
-    Jobs,
-    Limit,
-    Parse,
-    RowCursor,
-    Strict,
-)
+from skills.api.dependencies import Actor, Db, Digest, Incoming, Jobs, Limit, Parse, RowCursor, Strict
 from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
-from skills.api.responses import (
-    Condition,
-    Giving,
-    refuse_changed,
-    stored,
-    stored_file,
-)
+from skills.api.responses import Condition, Giving, refuse_changed, stored, stored_file
 from skills.api.routes.policies import Accept
 from skills.api.routes.recordings import RAW_BODY
 from skills.formats import BYTES, MEDIA_TYPES
@@ -101,11 +85,7 @@ def get_demo(demo: Digest, db: Db, give: Giving) -> Response:
         return give(Demonstration.model_validate(demos.find_demo(session, demo)))
 
 
-@router.get(
-    "/demos/{demo}/recording",
-    dependencies=[needs("reader")],
-    **gives_file((BYTES, *MEDIA_TYPES), 404, 409),
-)
+@router.get("/demos/{demo}/recording", dependencies=[needs("reader")], **gives_file((BYTES, *MEDIA_TYPES), 404, 409))
 def get_demo_recording(
     demo: Digest, db: Db, request: Request, if_none_match: Condition = None, accept: Accept = "*/*"
 ) -> Response:

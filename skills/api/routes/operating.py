@@ -18,7 +18,7 @@ from skills.api.responses import say
 from skills.errors import BadInput, NotSignedIn
 from skills.jobs.readiness import refuse_unready
 from skills.library.operation.proofs import checkpoint_json, served_json
-from skills.library.people.keys import sign_in, sign_out
+from skills.library.people.sign_ins import sign_in, sign_out
 from skills.sandbox.containment import LAYERS
 from skills.sandbox.forked import layers_held
 from skills.schemas.given import Alive, Ready, ServedAt, SignedCheckpoint

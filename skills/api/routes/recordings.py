@@ -6,23 +6,10 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import Field
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import (
-    Actor,
-    Db,
-    Digest,
-    Incoming,
-    Limit,
-    Parse,
-    RowCursor,
-    Strict,
-)
+from skills.api.dependencies import Actor, Db, Digest, Incoming, Limit, Parse, RowCursor, Strict
 from skills.api.openapi import ends, gives, gives_page, makes, router_of, says
 from skills.api.pages import render
-from skills.api.responses import (
-    Giving,
-    say,
-    stored,
-)
+from skills.api.responses import Giving, say, stored
 from skills.api.routes.pages import PageRoute, Picked
 from skills.formats import BYTES, MEDIA_TYPES
 from skills.library.operation import locks, overview

@@ -11,13 +11,7 @@ from typing import Any, Literal, NamedTuple
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import (
-    Demonstration,
-    Plan,
-    PolicyVersion,
-    StoredPlayback,
-    StoredRecording,
-)
+from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording
 from skills.db.session import Database
 from skills.errors import NotFound
 from skills.library.people.recorded import recording_for, shown_recording
