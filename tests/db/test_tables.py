@@ -29,6 +29,7 @@ from tests import backends
 from tests.db.test_packed import PLAYBACK
 from tests.library import cases
 from tests.library.styles import retrain
+from tests.library.test_scores import calibration
 
 FROZEN = (
     "recordings",
@@ -87,7 +88,7 @@ def fill(database: Database) -> None:
         session.add(played)
         session.flush()
         session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
-        session.add(StoredCalibration(sha256="0" * 64, about={}))
+        session.add(StoredCalibration(sha256="0" * 64, about=calibration("Suturing")))
         session.add(DemonstrationOutcome(demonstration_row=demo.row, outcome="failure", reason="fell", actor="ada"))
         session.add(ProposalMark(recording_row=demo.recording_row, number=1, state="rejected", actor="ada"))
         job = service_tables.Job(id="0" * 16, kind="dataset", identity="0" * 64, request={})
@@ -136,7 +137,7 @@ def changed(column: str) -> str:
         return f"{column} + 0.25"
     if column.endswith("_at"):
         return f"{column} + interval '1 second'"
-    return {"demo": "'\\x00'", "path": "'\\x00'", "report": "'{}'"}.get(column, "'other'")
+    return {"demo": "'\\x00'", "path": "'\\x00'", "report": "'{}'", "segment": "'{}'"}.get(column, "'other'")
 
 
 @pytest.mark.parametrize("table", WITHDRAWABLE)

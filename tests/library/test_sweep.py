@@ -152,7 +152,7 @@ def test_a_content_half_cached_is_not_used_and_is_completed(
 def test_a_deleted_recording_is_gone_at_once_and_swept_later(database: Database, small: None):
     stored, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
     with database.writing() as session:
-        delete_recording(session, stored.sha256, "test", anybodys=True)
+        delete_recording(session, stored.sha256, "test", as_admin=True)
     with database.reading() as session, pytest.raises(NotFound):
         find_recording(session, stored.sha256)
     assert count(database, RecordingChunk) > 0
