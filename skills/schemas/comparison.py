@@ -188,7 +188,7 @@ class Atlas(Given):
     merges: list[Merge] = Field(description="The dendrogram, in increasing order of distance.")
     order: list[Count] = Field(description="Indices of the demonstrations, in an order in which no two merges cross.")
     clusters: list[Cluster]
-    clusters_chosen: str = Field(description="How their number was chosen.")
+    clusters_chosen: str = Field(description="The rule by which their number was chosen.")
     silhouette: float | None = Field(
         description="The mean over the demonstrations, -1 to 1; null for a single cluster."
     )
@@ -207,7 +207,7 @@ class Atlas(Given):
     recognised: RecognisedDemo | None = Field(
         description="Of the demonstration `demo` of the request; null without one, or without recognition."
     )
-    notes: list[str] = Field(description="How to read the numbers, and what they do not show.")
+    notes: list[str] = Field(description="Explanations of the numbers and their limits.")
 
 
 class Neighbour(Given):

@@ -21,6 +21,7 @@ from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.releases import withdraw
 from skills.library.recordings.demos import withdraw_demo
+from skills.schemas.comparison import Atlas
 from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.comparison.cohort import cohort
@@ -63,7 +64,7 @@ def kept(database: Database) -> dict[int, str]:
         return {row.demonstration_row: digest(row.measured) for row in session.scalars(select(MeasuredShape))}
 
 
-def far(found: atlas.Atlas) -> np.ndarray:
+def far(found: Atlas) -> np.ndarray:
     size = len(found.demos)
     whole = np.zeros((size, size))
     for at, row in enumerate(found.distances):
@@ -87,7 +88,7 @@ def test_eight_surgeons_in_five_sessions_are_recognised_and_told_apart(database:
     assert seen.log_loss < 0.5 * seen.log_loss_of_guessing == pytest.approx(0.5 * np.log(8))
     assert [one.demos for one in seen.curve] == [8] * 5 and seen.stranger_if_known < seen.stranger_if_left_out
     assert found.votes is not None and (found.votes.recordings, found.votes.right) == (40, seen.right)
-    whose = atlas_of(database, SUTURE, demo=names[12]).whose
+    whose = atlas_of(database, SUTURE, demo=names[12]).recognised
     assert whose is not None
     assert (whose.arm, whose.surgeon, whose.likely[0].surgeon) == ("PSM", cohorts.name(2), cohorts.name(2))
     assert sum(one.probability for one in whose.likely) == pytest.approx(1.0)
@@ -186,7 +187,7 @@ def test_it_is_measured_in_blocks_and_kept_block_by_block(
 
 def test_two_that_ask_at_once_measure_once(database: Database, measured: list[int]):
     small(database)
-    found: list[atlas.Atlas] = []
+    found: list[Atlas] = []
     threads = [Thread(target=lambda: found.append(atlas_of(database, SUTURE))) for _ in range(4)]
     for thread in threads:
         thread.start()

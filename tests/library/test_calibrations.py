@@ -67,8 +67,8 @@ def copied(small: Path, tmp_path: Path) -> Path:
 def test_eight_surgeons_are_rated_well_by_a_model_that_has_not_seen_them(read: Rated, about: Calibration) -> None:
     judged = asdict(about.validated.tasks["Suturing"])
     print(judged)
-    assert read.data["surgeons"] == 8 and read.data["trials"] == judged["trials"] == 40
-    assert read.data["tasks"]["Suturing"]["levels"] == {"novice": 15, "intermediate": 10, "expert": 15}
+    assert read.data.surgeons == 8 and read.data.trials == judged["trials"] == 40
+    assert read.data.tasks["Suturing"].levels == {"novice": 15, "intermediate": 10, "expert": 15}
     assert judged["model"]["rho"] > 0.9 and judged["model"]["rho_interval"][0] > 0.6
     assert judged["model"]["accuracy"] > judged["chance"]["commonest"]
     assert judged["over_duration"][0] > 0.1
@@ -142,7 +142,7 @@ def test_all_tasks_are_read_or_those_that_are_named(copied: Path) -> None:
     both = read_cohort(copied)
     assert both.cohort.names == ("Knot_Tying", "Suturing") and both.data.trials == 15
     assert both.data.surgeons == 5  # a letter is one surgeon in both
-    assert read_cohort(copied, tasks=["Suturing"]).data["trials"] == 10
+    assert read_cohort(copied, tasks=["Suturing"]).data.trials == 10
     with pytest.raises(BadInput, match="has trials of Knot_Tying, Suturing, not of Sewing"):
         read_cohort(copied, tasks=["Suturing", "Sewing"])
 
@@ -167,7 +167,7 @@ def test_names_that_do_not_match_are_named(copied: Path) -> None:
         "rated, but without a kinematics file": ["Suturing_B901"],
         "unrated": ["Suturing_B001"],
     }
-    assert (found.data["trials"], found.data["left_out"]) == (9, 1)
+    assert (found.data.trials, found.data.left_out) == (9, 1)
     meta.write_text("")
     with pytest.raises(BadInput, match="10 of 10 trials: Suturing_B001"):
         read_cohort(copied)
@@ -223,7 +223,7 @@ def test_an_empty_trial_is_left_out_and_named(copied: Path) -> None:
     (copied / "Suturing/kinematics/AllGestures/Suturing_C002.txt").write_bytes(b"")
     found = read_cohort(copied)
     assert found.left_out == {"empty": ["Suturing_C002"]}
-    assert (found.data["trials"], found.data["left_out"]) == (9, 1)
+    assert (found.data.trials, found.data.left_out) == (9, 1)
 
 
 # ---- accepted models ---------------------------------------------------------------------------------------------
@@ -289,7 +289,7 @@ def test_trials_that_are_too_short_are_left_out_and_named(copied: Path) -> None:
     names[0].write_bytes(as_text(kinematics(60)))
     found = read_cohort(copied)
     assert found.left_out == {"too short to be measured": ["Suturing_B001"]}
-    assert (found.data["trials"], found.data["left_out"]) == (9, 1)
+    assert (found.data.trials, found.data.left_out) == (9, 1)
     for name in names:
         name.write_bytes(as_text(kinematics(60)))
     with pytest.raises(BadInput, match="None of 10 trials can be measured"):

@@ -38,7 +38,7 @@ class SurgeonsRecorded(NamedTuple):
 
     @property
     def single(self) -> bool:
-        """Whether nobody else is recorded beside one surgeon."""
+        """True if exactly one surgeon is recorded."""
         return len(self.surgeons) == 1 and not self.erased
 
     def may(self, use: consent.Use) -> bool:
