@@ -72,9 +72,7 @@ class DemoKeywords(TypedDict, total=False):
         ),
     ]
     session: Annotated[str | None, Doc("A name for recordings that were made together, such as 2026-11-23-a.")]
-    outcome: Annotated[
-        Literal["success", "recovery", "failure"] | None, Doc("What became of the hand-off, where it is known.")
-    ]
+    outcome: Annotated[Literal["success", "recovery", "failure"] | None, Doc("Of the hand-off, where it is known.")]
     outcome_reason: Annotated[str | None, Doc("Why; needed for a recovery or a failure.")]
 
 
@@ -102,15 +100,15 @@ class DatasetKeywords(TypedDict, total=False):
     fps: Annotated[int, Doc("Frames per second, at most the rate of the recordings; by default 30.")]
     split: Annotated[
         Literal["surgeon", "session"],
-        Doc("What is in one split only: all of a surgeon, or all of a recording; by default surgeon."),
+        Doc("The group that is in one split only: all of a surgeon, or all of a recording; by default surgeon."),
     ]
     arms: Annotated[
         Sequence[str] | None, Doc("The arms of every episode; left out, those that all of the recordings have.")
     ]
     name: Annotated[str, Doc("The dataset's title; by default Needle hand-offs.")]
     licence: Annotated[str, Doc("Its licence, such as CC-BY-4.0; by default unknown.")]
-    description: Annotated[str, Doc("What it contains, for its README; by default Not stated..")]
-    procedure: Annotated[str, Doc("How it was collected, for its README; by default Not stated..")]
+    description: Annotated[str, Doc("Its contents, for its README; by default Not stated..")]
+    procedure: Annotated[str, Doc("The procedure of its collection, for its README; by default Not stated..")]
 
 
 class TrainingKeywords(TypedDict, total=False):

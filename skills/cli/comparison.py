@@ -17,7 +17,7 @@ from skills.keywords import ScoreKeywords
 from skills.remedies import did_you_mean
 
 if TYPE_CHECKING:
-    from skills.client import Client
+    from skills.client.blocking.client import Client
     from skills.schemas.comparison import Atlas, Recognition
     from skills.schemas.scores import Score
 

@@ -47,6 +47,7 @@ from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
 from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.planning.trajectory import Trajectory
+from skills.schemas.calibrations import Calibration
 from skills.schemas.demos import ChosenSegment, DemoReport
 from skills.schemas.people import Consent
 from skills.schemas.policy_document import POLICY_CLASSES
@@ -487,5 +488,5 @@ class StoredCalibration(Base):
 
     row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256)
-    about: Mapped[dict[str, Any]]
+    about: Mapped[Calibration] = mapped_column(AsJson(Calibration))
     created_at: Mapped[datetime] = mapped_column(default=now)

@@ -138,6 +138,7 @@ class StoredDataset(Base):
     """An exported dataset, identified by the SHA-256 of its zip file."""
 
     __tablename__ = "datasets"
+    media_type = "application/zip"
 
     row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
