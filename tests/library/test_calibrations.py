@@ -253,7 +253,7 @@ def test_one_rated_task_of_two_is_enough_to_be_kept(
 ) -> None:
     tasks = {"Knot_Tying": unknowable.validated.tasks["Suturing"], **about.validated.tasks}
     both = about.model_copy(update={"validated": replace(about.validated, tasks=tasks)})
-    assert refusals(asdict(tasks["Knot_Tying"])) and accepted(both) == ["Suturing"]
+    assert refusals(tasks["Knot_Tying"]) and accepted(both) == ["Suturing"]
     with database.writing() as session:
         assert put_calibration(session, both, "test")[1]
 
