@@ -36,6 +36,7 @@ remedy" if the remedy reads the same for every interface; otherwise the remedy i
 line and Python each word in their own terms (`skills.remedies`). Only `skills.api.problems` knows the status codes.
 """
 
+import re
 from collections.abc import Mapping
 from typing import TypeVar
 
@@ -46,10 +47,17 @@ class SkillsError(Exception):
     """Base class of all errors.
 
     Attributes:
+        kind: The stable name of the kind of error, such as "outside-grid".
         message: The fault, in words that fit every interface.
         remedies: Remedies: an action, or a sentence that fits every interface.
         numbers: The offending values, safe to show to the caller.
     """
+
+    kind = "skills-error"
+
+    def __init_subclass__(cls) -> None:
+        """Name the kind after the class: OutsideGrid is outside-grid."""
+        cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "-", cls.__name__).lower()
 
     def __init__(self, message: str, *remedies: Remedy | str, **numbers: object) -> None:
         super().__init__(message)

@@ -141,6 +141,12 @@ def canonical(data: Any) -> bytes:
 _canonical = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False).encode
 
 
+def digest_of(tree: Any, arrays: Arrays) -> str:
+    """Return the SHA-256 of a flattened value in hex: of its numbers and names, independent of their stored form."""
+    shape = [[str(a.dtype), list(a.shape), hashlib.sha256(a.data).hexdigest()] for a in arrays]
+    return sha256(canonical([tree, shape]))
+
+
 def write(file: IO[bytes], value: Any, classes: Known) -> None:
     """Write a value to a file as an archive, uncompressed for speed."""
     arrays: Arrays = []

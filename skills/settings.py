@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from functools import cache
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -204,7 +204,7 @@ def settings() -> Settings:
             for one in error.errors()
         ]
         choices = [one for one in error.errors() if one["type"] == "literal_error"]  # their values are no secrets
-        known = [(str(one["input"]), re.findall("'([^']+)'", one["ctx"]["expected"])) for one in choices]
+        known = [(str(one["input"]), get_args(Settings.model_fields[str(one["loc"][0])].annotation)) for one in choices]
         near = [meant for given, names in known for meant in did_you_mean(given, names)]
         raise BadSettings(f"{'; '.join(said)}.", *near, "Set it to such a value, or unset it.") from None
 

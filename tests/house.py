@@ -36,6 +36,7 @@ LAYERS = (
     "api",
     "api/routes",
     "client",
+    "client/blocking",
     "cli",
     "comparison",
     "verification",
@@ -63,6 +64,7 @@ NOUNS = {
     "Trajectory": "value, schema",
     "History": "of a database, and its calls at the client",
     "Problem": "schema, and the error of the client that carries it",
+    "Socket": "of the asynchronous client, and of the blocking one",
     "Coverage": "value, stored under this name, and the schema of its figures",
     "SuturePoint": "value, stored under this name, and the schema of one that was found",
 }
@@ -123,10 +125,11 @@ def one_noun(places: set[str]) -> bool:
 
 
 def sources(folder: Path) -> Iterator[Path]:
-    """List the Python files below a folder, without those reached through links, and without migrations."""
+    """List the Python files below a folder, without those reached through links, migrations, and generated files."""
     for file in sorted(folder.rglob("*.py")):
         inside = file.relative_to(folder).parents
-        if not any((folder / part).is_symlink() for part in inside) and "versions" not in file.parts:
+        linked = any((folder / part).is_symlink() for part in inside)
+        if not linked and "versions" not in file.parts and not file.read_text().startswith(GENERATED):
             yield file
 
 

@@ -17,8 +17,8 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from skills.cli import app
+from skills.cli.completion import complete_surgeons, complete_sutures
 from skills.cli.policies import DEFAULT_LEARNER, _learner
-from skills.cli.shell import complete_surgeons, complete_sutures
 from skills.errors import BadInput
 from skills.learning.policy import LEARNERS
 from skills.settings import settings
@@ -102,7 +102,7 @@ def completed(line: str, **settings: str) -> tuple[list[str], str]:
 
 
 def test_tab_proposes_the_surgeons_and_sutures_that_there_are(skills, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("skills.cli.shell.LIMIT_S", 60.0)
+    monkeypatch.setattr("skills.cli.completion.LIMIT_S", 60.0)
     (tmp_path / "skills.sqlite").unlink()
     assert complete_surgeons("") == [], "there is no database yet"
     assert not (tmp_path / "skills.sqlite").exists()
@@ -138,13 +138,13 @@ def test_tab_in_a_shell_is_silent_whatever_is_wrong(wrong: dict[str, str], tmp_p
 def test_tab_is_silent_if_a_library_is_still_at_work_when_time_is_up() -> None:
     """The destructor of the thread's own data aborts, as a library in C++ does whose thread is made to exit."""
     script = (
-        "import ctypes, time; from skills.cli import shell; shell.LIMIT_S = 0.1\n"
+        "import ctypes, time; from skills.cli import completion; completion.LIMIT_S = 0.1\n"
         "def hangs():\n"
         "    libc, key = ctypes.CDLL(None), ctypes.c_uint()\n"
         "    libc.pthread_key_create(ctypes.byref(key), libc.abort)\n"
         "    libc.pthread_setspecific(key, ctypes.c_void_p(1))\n"
         "    while True: time.sleep(0.0001)\n"
-        "print(shell._in_time(hangs, ''))"
+        "print(completion._in_time(hangs, ''))"
     )
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "[]\n", "")

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.cli.shell import connect
+from skills.cli.connecting import connect
 from skills.library.people.keys import LADDER
 from skills.settings import Settings, settings
 from tests.api.service import copy_of_trained

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from skills import logs
-from skills.client import Client
+from skills.client.blocking.client import Client
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.demo import wait_until_ready

@@ -14,8 +14,10 @@ import skills
 from skills import errors
 from skills.api.problems import answer_to
 from skills.cli import app
-from skills.client import Client, Problem
+from skills.client import Problem
+from skills.client.blocking.client import Client
 from skills.remedies import Action, Door, Remedy, did_you_mean, read_remedies
+from skills.schemas.given import Problem as ProblemDocument
 from skills.schemas.requests import in_words
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
@@ -103,9 +105,8 @@ def test_no_message_in_the_source_has_the_words_of_a_door():
 
 
 def test_remedies_of_another_version_are_left_out_and_sentences_are_kept():
-    said = ["Do it.", {"action": "fly"}, {"action": "add-surgeon"}, {"action": "list-demos"}, 3]
+    said = ["Do it.", {"action": "fly"}, {"action": "add-surgeon"}, {"action": "list-demos"}]
     assert read_remedies(said) == ["Do it.", Remedy(Action.LIST_DEMOS)]
-    assert read_remedies("no list") == []
     with pytest.raises(TypeError):
         Remedy(Action.ADD_SURGEON, suture="wrong")
 
@@ -124,7 +125,7 @@ def test_an_error_is_worded_by_each_door():
     assert said["detail"] == "There is no surgeon 'wren'. Look. PUT /surgeons/wren adds one."
     assert said["reason"] == "There is no surgeon 'wren'."
     assert said["remedies"] == ["Look.", {"action": "add-surgeon", "surgeon": "wren"}]
-    assert str(Problem(404, said)) == str(error)
+    assert str(Problem(ProblemDocument.model_validate(said))) == str(error)
 
 
 def test_near_misses_are_suggested_and_others_are_not():
@@ -147,7 +148,7 @@ def patterns_of(document: object) -> Iterator[str]:
 @pytest.fixture
 def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
     """Yield the client of a separate service; the commands use the same database."""
-    from skills.cli.shell import connect
+    from skills.cli.connecting import connect
 
     monkeypatch.setenv("SKILLS_DATABASE_URL", backends.place(tmp_path / "skills.sqlite"))
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
@@ -175,7 +176,7 @@ def test_a_refusal_reads_in_the_words_of_service_client_and_command(door: Client
         door.surgeon("kestral")
     said = str(refused.value)
     assert said == ("There is no surgeon 'kestral'. Did you mean 'kestrel'? Add one: client.put_surgeon('kestral').")
-    assert "PUT /surgeons/kestral adds one." in refused.value.body["detail"]
+    assert "PUT /surgeons/kestral adds one." in refused.value.document.detail
     result = CliRunner().invoke(app, ["surgeon", "show", "kestral"])
     assert result.stderr.splitlines() == [
         "There is no surgeon 'kestral'.",
@@ -193,11 +194,11 @@ def test_a_refused_argument_is_named_with_value_and_limit_at_each_door(door: Cli
         "'Kestrel' was given",
         "suture_points.0.position_mm.2 must be at most 10000; 99999 was given",
     ]
-    assert "Kestrel" not in json.dumps(refused.value.body)
+    assert "Kestrel" not in refused.value.document.model_dump_json()
     result = CliRunner().invoke(app, ["plan", "kestrel", "simple-running", "--point", "5,55,99999"])
     assert result.stderr.splitlines()[0] == "--point must be at most 10000; 99999 was given"
-    with pytest.raises(TypeError, match=r"no argument 'point'\. Did you mean 'suture_points'"):
-        door.plan("kestrel", "simple-running", point=[far])  # type: ignore[call-arg]
+    with pytest.raises(Problem, match=r"has an unknown field \(did you mean 'speed_mm_s'\?\)"):
+        door.plan("kestrel", "simple-running", [far], speed_mm=5)  # type: ignore[call-arg]
 
 
 CALL = {"surgeon": "kestrel", "suture": "simple-running"}
@@ -249,7 +250,7 @@ def test_an_unknown_call_is_refused_in_the_words_of_each_door(door: Client):
         door.get_json("/nothing")
     assert foreign(Door.PYTHON, str(refused.value)) == []
     assert "help(client)" in str(refused.value)
-    assert "openapi.json" in refused.value.body["detail"]
+    assert "openapi.json" in refused.value.document.detail
 
 
 def test_how_bytes_were_read_is_told_in_words(door: Client):

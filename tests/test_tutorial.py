@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from skills.cli import app
-from skills.cli.shell import out
+from skills.cli.output import out
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
 from tests.formats import bags
@@ -83,7 +83,7 @@ def test_a_user_at_a_terminal_is_asked_what_is_open(bare: None, monkeypatch: pyt
     assert "--errors" not in result.stdout  # choices are numbers there, not commands
     assert Path("kept/skills.sqlite").is_file()
     assert run("skills try five-hand-offs.mcap --folder kept --segment 9").exit_code == 1
-    refused = run("skills try five-hand-offs.mcap --folder kept --tissue high")
+    refused = run("skills try five-hand-offs.mcap --folder kept --tissue-mm high")
     assert (refused.exit_code, "neither a height in mm nor none" in refused.output) == (1, True)
 
 
@@ -102,14 +102,14 @@ def test_the_command_of_a_choice_keeps_what_was_typed(bare: None) -> None:
     assert result.exit_code == 1 and "column" in result.output  # an MCAP file takes no columns
     result = run("skills try five-hand-offs.mcap --surgeon lark --folder 'my folder' --cell-mm 4 --no-release")
     assert result.exit_code == 3
-    said = "skills try five-hand-offs.mcap --surgeon=lark --no-release --cell-mm=4 '--folder=my folder' --segment=2\n"
+    said = "skills try five-hand-offs.mcap --cell-mm=4 --no-release --surgeon=lark '--folder=my folder' --segment=2\n"
     assert said in result.stdout, result.stdout
 
 
 @pytest.mark.nightly
 def test_the_real_sample_bag_comes_to_a_verdict(bare: None) -> None:
     bag = bags.sample_folder() / "rosbag2"
-    result = run(f"skills try {shlex.quote(str(bag))} --tissue=-190 --errors calibrated --release")
+    result = run(f"skills try {shlex.quote(str(bag))} --tissue-mm=-190 --errors calibrated --release")
     assert result.exit_code == 0, result.output
     assert "4 mm cells with hysteresis 0.25" in result.stdout and "feasible in an exact simulation" in result.stdout
 

@@ -25,7 +25,7 @@ for python in "$@"; do
     $skills train kestrel simple-running --release --json >trained.json
     "$bare/bin/python" -c 'import json; assert json.load(open("trained.json"))["result"]["released"]'
     echo "$version: trained and released"
-    $skills plan kestrel simple-running --point 5,55,-120 --tissue=-165 --no-handoff --json >plan.json
+    $skills plan kestrel simple-running --point 5,55,-120 --tissue-mm=-165 --no-handoff --json >plan.json
     plan=$("$bare/bin/python" -c 'import json; print(json.load(open("plan.json"))["id"])')
     if "$bare/bin/python" -c 'import pybullet' >/dev/null 2>&1; then
       $skills play "$plan" >played.txt

@@ -22,18 +22,8 @@ from skills.db.session import Database
 from skills.db.weighted_cache import WeightedCache
 from skills.errors import Busy, NotSignedIn, TooMany
 from skills.library.operation.locks import SIGN_INS
-from skills.library.people.keys import (
-    SHAPE,
-    Holder,
-    Lasts,
-    csrf_of,
-    digest_of,
-    holders_of,
-    is_keyless,
-    is_owner,
-    note_use,
-    signed_in,
-)
+from skills.library.people.keys import SHAPE, Holder, digest_of, holders_of, is_keyless, is_owner
+from skills.library.people.sign_ins import SignInLifetime, csrf_of, note_use, signed_in
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 
@@ -65,7 +55,7 @@ class Access:
     def __init__(self, database: Database, settings: Settings) -> None:
         self.own_key = secrets.token_urlsafe(32)
         self.limits = RateLimits(settings)
-        self.lasts = Lasts(settings.sign_in_idle_s, settings.sign_in_s)
+        self.lasts = SignInLifetime(settings.sign_in_idle_s, settings.sign_in_s)
         self._own_digest = digest_of(self.own_key)
         self._database = database
         # a separate pool, which slow requests cannot exhaust

@@ -122,11 +122,6 @@ LIMITS = {
 TOO_LARGE = problem(413, "http-413", TITLES[413], DETAILS[413])  # replaces Starlette's plain-text response
 
 
-def kind_of(error: errors.SkillsError) -> str:
-    """Return the stable kind of an error from its class name: OutsideGrid becomes outside-grid."""
-    return re.sub(r"(?<!^)(?=[A-Z])", "-", type(error).__name__).lower()
-
-
 def _where(one: dict[str, Any]) -> str:
     """Return the path of a refused field; the name of an unknown field is omitted, as text that the client sent."""
     known = one["loc"][:-1] if one["type"] == "extra_forbidden" else one["loc"]
@@ -220,7 +215,7 @@ def answer_to(error: errors.SkillsError) -> Response:
             more["reason"] = error.message
             if error.remedies:
                 more["remedies"] = [one if isinstance(one, str) else one.as_json() for one in error.remedies]
-            return problem(status, kind_of(error), title, error.words(Door.HTTP), headers=headers, **more)
+            return problem(status, error.kind, title, error.words(Door.HTTP), headers=headers, **more)
     raise error
 
 

@@ -4,7 +4,6 @@ Commands print tables for people, or one JSON document with `--json`; the exit c
 are made inside the commands, so that `skills --help` is fast.
 """
 
-import re
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -13,11 +12,26 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from skills.cli import comparison, demos, installation, plans, policies, recordings, tries
-from skills.cli.shell import err, out, tell
+from skills.cli import (
+    arms,
+    calibrations,
+    comparison,
+    datasets,
+    demos,
+    jobs,
+    keys,
+    operation,
+    people,
+    plans,
+    policies,
+    recordings,
+    report,
+    trials,
+    tries,
+)
+from skills.cli.commands import print_error
+from skills.cli.output import err, out
 from skills.remedies import did_you_mean
-
-CHOICES = re.compile(r"'([^']*)' is not one of (.+?)\.?$")
 
 
 class Commands(TyperGroup):
@@ -41,28 +55,26 @@ class Commands(TyperGroup):
             sys.exit(run() or 0)
         except typer.Abort:
             err.print()
-            tell("Nothing was done: it was not confirmed.", ["Answer y, or give --yes."])
+            print_error("Nothing was done: it was not confirmed.", ["Answer y, or give --yes."])
             sys.exit(1)
         except typer.TyperException as error:
-            wrong, advice = _in_words(error)
-            tell(wrong, advice)
+            wrong, advice = _describe(error)
+            print_error(wrong, advice)
             sys.exit(error.exit_code)
 
 
-def _in_words(error: typer.TyperException) -> tuple[str, list[str]]:
-    """Return a usage error as the fault and the remedies, with the most similar name if there is one."""
-    said = " ".join(error.format_message().split()).replace("Value error, ", "")
-    said = said.partition(", unable to parse")[0].replace("Input should be", "it must be")
-    wrong, _, suggested = said.partition(" Did you mean ")
-    wrong, _, options = wrong.partition(" (Possible options: ")
-    advice = [f"Did you mean {suggested}"] if suggested else []
-    if options:
-        advice += did_you_mean(wrong.rpartition(" ")[2], options.rstrip(")").split(", "))
-    if (choices := CHOICES.search(wrong)) is not None:
-        advice += did_you_mean(choices[1], re.findall(r"'([^']*)'", choices[2]))
+def _describe(error: typer.TyperException) -> tuple[str, list[str]]:
+    """Return a usage error as the fault and the remedies, with the most similar option if there is one."""
+    options = getattr(error, "possibilities", None)  # of an unknown option
+    fault = error.message if options else error.format_message()
+    # the words of pydantic, with which Typer checks numbers
+    fault = (
+        fault.replace("Value error, ", "").replace("Input should be", "it must be").partition(", unable to parse")[0]
+    )
+    advice = did_you_mean(getattr(error, "option_name", ""), options) if options else []
     context = getattr(error, "ctx", None)
     path = "skills" if context is None else " ".join(["skills", *context.command_path.split()[1:]])
-    return wrong, [*advice, f"See the help: {path} --help"]
+    return " ".join(fault.split()), [*advice, f"See the help: {path} --help"]
 
 
 app = typer.Typer(
@@ -73,20 +85,10 @@ app = typer.Typer(
     help="Suture styles: learn, certify, serve and check. Research use only.",
 )
 for commands in (  # the order of the commands in `skills --help`
-    installation.commands,
-    installation.key_commands,
-    tries.commands,
-    recordings.commands,
-    demos.commands,
-    policies.learning_commands,
-    policies.commands,
-    plans.commands,
-    comparison.commands,
-    comparison.scoring_commands,
-    comparison.report_commands,
-    recordings.surgeon_commands,
+    *(operation, keys, tries, recordings, demos, trials, datasets, jobs, policies, plans, arms),
+    *(comparison, calibrations, report, people),
 ):
-    app.add_typer(commands)
+    app.add_typer(commands.commands)
 
 
 def _print_version(asked: bool) -> None:

@@ -34,16 +34,11 @@ from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import Pause
 from skills.demonstration.partner import Partner, PartnerMotion
-from skills.gridworld.grid import GridPath, GridWorld
-from skills.gridworld.hazards import SceneCosts, Surroundings
-from skills.gridworld.reward import RewardLevels, RewardMap
-from skills.gridworld.scene import Box, Capsule, Scene, Tissue
+from skills.gridworld.grid import GridPath
+from skills.gridworld.reward import RewardMap
 from skills.learning.certificate import Coverage
-from skills.learning.networks import Network
-from skills.learning.policy import LEARNERS, Policy
+from skills.learning.policy import Policy
 from skills.learning.pose_style import PosePath
-from skills.learning.q_learning import Training
-from skills.learning.ties import ShortestApproach
 from skills.learning.tube import CertifiedPoses
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 from skills.packing import store_as_palette
@@ -52,19 +47,19 @@ from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
 from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.planning.trajectory import Trajectory
+from skills.schemas.calibrations import Calibration
 from skills.schemas.demos import ChosenSegment, DemoReport
 from skills.schemas.people import Consent
+from skills.schemas.policy_document import POLICY_CLASSES
 from skills.schemas.recordings import RecordingContent, TableIn
 from skills.verification.playback import Pictures, Playback
 
-stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestApproach)
+stored(*POLICY_CLASSES.values())
 stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
 stored(PosePath, PartnerMotion, TubeLimits, TubeCertificate)
 stored(Trajectory, OtherArm, Poses)
-stored(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
 # A field that is added to one of these after 0.3.0 is released is registered here, with `skills.packing.added_later`.
 store_as_palette(Coverage, "share")  # one for each waypoint
-store_as_palette(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 
 class Surgeon(Numbered):
@@ -478,5 +473,5 @@ class StoredCalibration(Numbered):
     __tablename__ = "calibrations"
 
     sha256: Mapped[str] = mapped_column(Sha256)
-    about: Mapped[dict[str, Any]]
+    about: Mapped[Calibration] = mapped_column(AsJson(Calibration))
     created_at: Mapped[datetime] = mapped_column(default=now)

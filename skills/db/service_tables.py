@@ -136,6 +136,7 @@ class StoredDataset(Numbered):
     """An exported dataset, identified by the SHA-256 of its zip file."""
 
     __tablename__ = "datasets"
+    media_type = "application/zip"
 
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"), unique=True)

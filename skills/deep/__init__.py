@@ -64,7 +64,7 @@ KNOWN = known(
 )
 
 
-Tell = Callable[[float], None]
+Progress = Callable[[float], None]
 
 
 def require_installed(learner: Learner) -> None:
@@ -89,7 +89,7 @@ def learn_policy(
     seed: int = 0,
     *,
     ties: ShortestApproach | None = REMOTE_CENTRE,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
     timeout_s: float = TIMEOUT_S,
     memory_bytes: int = MEMORY_BYTES,
 ) -> Policy:
@@ -101,7 +101,8 @@ def learn_policy(
             process.
         seed: Seed of all random numbers.
         ties: The rule among equally good actions, as for `learn_tabular`; not used by learners with a network.
-        tell: Callback for the progress, from 0 to 1, about every second; an exception that it raises ends the training.
+        progress: Callback with the progress, from 0 to 1, about every second; an exception that it raises ends the
+            training.
         timeout_s: Seconds of wall time after which the separate process is killed.
         memory_bytes: Limit of the separate process's address space.
 
@@ -117,15 +118,15 @@ def learn_policy(
         return table.learn_tabular(reward, learner, seed, ties)
     check_learnable(reward, learner, seed)
     require_installed(learner)
-    learnt = _learn_aside(NetworkLesson(reward, learner, seed), tell, ProcessLimits(memory_bytes, timeout_s))
+    learnt = _learn_in_process(NetworkLesson(reward, learner, seed), progress, ProcessLimits(memory_bytes, timeout_s))
     q = network_q(reward, learner, learnt.network)
     return Policy(reward.path, reward.levels, learner, seed, learnt.training, q, learnt.network)
 
 
-def _learn_aside(lesson: NetworkLesson, tell: Tell | None, limits: ProcessLimits) -> LearntNetwork:
-    def watch(said: bytes) -> None:
-        if tell is not None and (steps := PROGRESS.findall(said)):
-            tell(min(float(steps[-1]), 1.0))
+def _learn_in_process(lesson: NetworkLesson, progress: Progress | None, limits: ProcessLimits) -> LearntNetwork:
+    def watch(output: bytes) -> None:
+        if progress is not None and (steps := PROGRESS.findall(output)):
+            progress(min(float(steps[-1]), 1.0))
 
     try:
         return call_alone(TARGET, lesson, returns=(LearntNetwork,), classes=KNOWN, limits=limits, watch=watch)

@@ -4,7 +4,7 @@
                                     --tables_of-->  tables  --write_page-->  one HTML page
 
 `rivals` computes the numbers of the rivals, `numbers` those of the figures and of Table I and all of them together;
-`drawings` draws them, and `page` formats them as tables, adds the text and writes HTML. No server is needed.
+`figures` draws them, `summary` formats them as tables, and `page` adds the text and writes HTML. No server is needed.
 """
 
 import json
@@ -14,7 +14,8 @@ from pathlib import Path
 
 from skills.errors import BadInput
 from skills.report.numbers import ABSENT, Effort, compute, paper_source, sample_source
-from skills.report.page import Chapter, Table, printed_rmse, tables_of, write_page
+from skills.report.page import Chapter, write_page
+from skills.report.summary import Table, printed_rmse, tables_of
 
 __all__ = ["ABSENT", "Effort", "Report", "write_report"]
 

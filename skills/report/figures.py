@@ -150,14 +150,14 @@ def _scale(figure: Figure, axes: Any, dots: Any, rewards: Floats) -> None:
 
 def draw_fig_6(numbers: Numbers) -> Figure:
     """Draw a recorded motion and its path, and the paper's path, whose own recording was not published."""
-    source, told = numbers.source, numbers.fig_6
+    source, found = numbers.source, numbers.fig_6
     panels = 2 if source.recorded_elsewhere else 1
     figure = _figure(6.2 * panels, 5.0)
-    rmse = ", ".join(f"{value:.2f}" for value in told.rmse_mm)
-    whose = "a raw recording of the study, of another motion" if source.recorded_elsewhere else source.title
-    axes = _space(figure, (1, panels, 1), f"{whose}\n{told.samples} samples, {told.states} states, RMSE {rmse} mm")
+    rmse = ", ".join(f"{value:.2f}" for value in found.rmse_mm)
+    title = "a raw recording of the study, of another motion" if source.recorded_elsewhere else source.title
+    axes = _space(figure, (1, panels, 1), f"{title}\n{found.samples} samples, {found.states} states, RMSE {rmse} mm")
     axes.plot(*source.recorded.tip_mm.T, color=RECORDED, linewidth=1.4, label="raw")
-    _path(axes, source.recorded.path, label=f"discretised, {told.cell_mm:g} mm")
+    _path(axes, source.recorded.path, label=f"discretised, {found.cell_mm:g} mm")
     _mark_ends(axes, source.recorded.path)
     if source.recorded_elsewhere:
         states, revisits = len(source.path.states), source.path.revisits
@@ -188,11 +188,11 @@ def draw_fig_8(numbers: Numbers) -> Figure:
     for row, by in enumerate(learners):
         mine = [one for one in numbers.fig_8 if one.by == by]
         for column, one in enumerate(mine, start=1):
-            _draw_learnt(_space(figure, (len(learners), 3, 3 * row + column), _told(one)), one)
+            _draw_learnt(_space(figure, (len(learners), 3, 3 * row + column), _title_of(one)), one)
     return _titled(figure, f"Fig. 8: three policies of {numbers.source.title}, with DTW", legend=True)
 
 
-def _told(one: LearntStyle) -> str:
+def _title_of(one: LearntStyle) -> str:
     states, of = len(one.rollout.states), len(one.rollout.path.states)
     end = "" if one.rollout.finished else ", never arrives"
     return f"{one.by}\n{one.which}: {states} states for {of}, DTW {one.dtw_total_mm:g} mm{end}"

@@ -1,106 +1,9 @@
-"""Values of atlases and scores, as the library builds them and a client reads them.
+"""Atlases of suture types, nearest neighbours, and recognition of surgeons: answers."""
 
-An atlas compares the demonstrations of a suture type with each other. A score compares motions; it says nothing about a
-surgical result and is not a credential.
-"""
-
-from typing import Any
-
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from skills.fields import Count, Fraction, Sha256, Slug
 from skills.schemas import Given
-
-# The example of the OpenAPI document.
-IDS = ["1a" * 32, "2b" * 32, "3c" * 32, "4d" * 32]
-EXAMPLE: dict[str, Any] = {
-    "suture": "simple-running",
-    "scaled": False,
-    "unit": "mm",
-    "demos": [
-        {"id": IDS[0], "surgeon": "heron", "session": "monday", "cluster": 1, "at": [-3.1, 0.4]},
-        {"id": IDS[1], "surgeon": "heron", "session": "friday", "cluster": 1, "at": [-2.7, -0.4]},
-        {"id": IDS[2], "surgeon": "kestrel", "session": "monday", "cluster": 2, "at": [2.8, 0.5]},
-        {"id": IDS[3], "surgeon": "kestrel", "session": "friday", "cluster": 2, "at": [3.0, -0.5]},
-    ],
-    "recordings": 4,
-    "left_out": {
-        "without_consent": 1,
-        "without_direction": [],
-        "overlapped": [],
-        "not_sampled": 0,
-        "because": ["Left out: 1 demonstration, ..."],
-    },
-    "distances": [[], [0.9], [6.0, 5.6], [6.2, 5.7, 1.0]],
-    "merges": [
-        {"one": 0, "other": 1, "distance": 0.9, "demos": 2},
-        {"one": 2, "other": 3, "distance": 1.0, "demos": 2},
-        {"one": 4, "other": 5, "distance": 5.875, "demos": 4},
-    ],
-    "order": [0, 1, 2, 3],
-    "clusters": [
-        {"cluster": 1, "demos": 2, "medoid": IDS[0], "spread": 0.9, "surgeons": [{"surgeon": "heron", "demos": 2}]},
-        {"cluster": 2, "demos": 2, "medoid": IDS[2], "spread": 1.0, "surgeons": [{"surgeon": "kestrel", "demos": 2}]},
-    ],
-    "clusters_chosen": "as asked",
-    "silhouette": 0.84,
-    "chart_shows": 0.97,
-    "surgeons": [
-        {
-            **{"surgeon": "heron", "demos": 2, "recordings": 2, "sessions": 2},
-            **{"medoid": IDS[0], "spread": 0.9, "mean_share": 0.34},
-        },
-        {
-            **{"surgeon": "kestrel", "demos": 2, "recordings": 2, "sessions": 2},
-            **{"medoid": IDS[2], "spread": 1.0, "mean_share": None},
-        },
-    ],
-    "differences": [
-        {
-            "one": "heron",
-            "other": "kestrel",
-            "distance": 6.0,
-            "part": "middle third",
-            "axis": "upwards",
-            "share": 0.5,
-            "offset": -8.9,
-            "size": 9.0,
-            "sentence": "In the middle third, the path of heron is 8.9 mm lower than that of kestrel; ...",
-            "shares": [[0.05, 0.05, 0.1], [0.05, 0.05, 0.5], [0.05, 0.05, 0.1]],
-            "offsets": [[0.1, 0.1, -1.6], [0.2, 0.3, -8.9], [0.1, 0.1, -1.7]],
-        }
-    ],
-    "recognition": [
-        {
-            "arm": "PSM2",
-            "compared": ["shape", "tempo"],
-            "surgeons": 2,
-            "tested": 4,
-            "right": 4,
-            "accuracy": 1.0,
-            "interval": [0.51, 1.0],
-            "chance": 0.5,
-            "log_loss": 0.02,
-            "log_loss_of_guessing": 0.693,
-            "sureness": 0.98,
-            "curve": [{"demos": 2, "predicted": 0.97, "right": 1.0}, {"demos": 2, "predicted": 0.99, "right": 1.0}],
-            "stranger_if_known": 0.3,
-            "stranger_if_left_out": 0.4,
-        }
-    ],
-    "no_recognition_because": None,
-    "votes": {"recordings": 4, "right": 4, "accuracy": 1.0, "interval": [0.51, 1.0], "chance": 0.5},
-    "recognised": {
-        "demo": IDS[3],
-        "arm": "PSM2",
-        "surgeon": "kestrel",
-        "likely": [{"surgeon": "kestrel", "probability": 0.98}, {"surgeon": "heron", "probability": 0.02}],
-        "none_of_these": 0.2,
-        "voted": "kestrel",
-        "voters": 1,
-    },
-    "notes": ["A distance is ...", "Set-up and day are confounded with the surgeon: ..."],
-}
 
 Thirds = list[tuple[float, float, float]]
 
@@ -273,8 +176,6 @@ class RecognisedRecording(Given):
 class Atlas(Given):
     """The demonstrations of a suture type, compared. Distances are in `unit`, about the mean difference per state."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
-
     suture: Slug
     scaled: bool
     unit: str = Field(description="mm, or lengths of start to goal where size does not count.")
@@ -287,7 +188,7 @@ class Atlas(Given):
     merges: list[Merge] = Field(description="The dendrogram, in increasing order of distance.")
     order: list[Count] = Field(description="Indices of the demonstrations, in an order in which no two merges cross.")
     clusters: list[Cluster]
-    clusters_chosen: str = Field(description="How their number was chosen.")
+    clusters_chosen: str = Field(description="The rule by which their number was chosen.")
     silhouette: float | None = Field(
         description="The mean over the demonstrations, -1 to 1; null for a single cluster."
     )
@@ -306,7 +207,7 @@ class Atlas(Given):
     recognised: RecognisedDemo | None = Field(
         description="Of the demonstration `demo` of the request; null without one, or without recognition."
     )
-    notes: list[str] = Field(description="How to read the numbers, and what they do not show.")
+    notes: list[str] = Field(description="Explanations of the numbers and their limits.")
 
 
 class Neighbour(Given):

@@ -44,15 +44,15 @@ class DatasetIn(Schema):
         default=30, description="Frames per second, at most the rate of the recordings."
     )
     split: Literal["surgeon", "session"] = Field(
-        default="surgeon", description="What is in one split only: all of a surgeon, or all of a recording."
+        default="surgeon", description="The group that is in one split only: all of a surgeon, or all of a recording."
     )
     arms: Annotated[list[Annotated[str, Field(pattern=ARM)]], Field(min_length=1, max_length=10)] | None = Field(
         default=None, description="The arms of every episode; left out, those that all of the recordings have."
     )
     name: Name = Field(default="Needle hand-offs", description="The dataset's title.")
     licence: Name = Field(default="unknown", description="Its licence, such as CC-BY-4.0.")
-    description: Text = Field(default="Not stated.", description="What it contains, for its README.")
-    procedure: Text = Field(default="Not stated.", description="How it was collected, for its README.")
+    description: Text = Field(default="Not stated.", description="Its contents, for its README.")
+    procedure: Text = Field(default="Not stated.", description="The procedure of its collection, for its README.")
 
     @model_validator(mode="after")
     def _named_or_filtered(self) -> Self:

@@ -78,11 +78,11 @@ class Demonstration(Given):
     instrument: str
     start_s: float
     end_s: float
-    segment: ChosenSegment = Field(description="Which part of the recording was taken.")
+    segment: ChosenSegment = Field(description="The part of the recording that was cut.")
     session: Slug | None
     hysteresis: float = Field(description="Cells.")
     state: Literal["active", "withdrawn"]
-    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off; null: not known.")
+    outcome: DemoOutcome | None = Field(default=None, description="Of the hand-off; null: not known.")
     outcome_reason: str | None = Field(default=None, description="Why, in the words of whoever marked it.")
     report: DemoReport
     created_at: datetime
@@ -147,7 +147,7 @@ class DemoIn(Schema):
     session: SlugField | None = Field(
         default=None, description="A name for recordings that were made together, such as 2026-11-23-a."
     )
-    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off, where it is known.")
+    outcome: DemoOutcome | None = Field(default=None, description="Of the hand-off, where it is known.")
     outcome_reason: Name | None = Field(default=None, description="Why; needed for a recovery or a failure.")
 
     @model_validator(mode="after")

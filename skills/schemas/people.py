@@ -81,7 +81,7 @@ class Key(Given):
     """An API key, as an admin sees it: its owner and permissions; its secret is stored nowhere."""
 
     key: str = Field(pattern=r"^[0-9a-f]{8}$", description="Its id, the part after `skills_`, which is no secret.")
-    owner: str = Field(description="Whose it is; events and releases bear this name.")
+    owner: str = Field(description="The owner's name, which events and releases record.")
     role: Literal["reader", "uploader", "trainer", "releaser", "admin"]
     surgeons: list[Slug] | None = Field(description="The surgeons that it is restricted to; null: all.")
     created_at: datetime
@@ -94,7 +94,7 @@ class Key(Given):
 class NewKey(Key):
     """A key that was just created, with its secret."""
 
-    secret: str = Field(description="What to show as `X-API-Key`; nobody can show it again.")
+    secret: str = Field(description="The value of the header `X-API-Key`; it cannot be shown again.")
 
 
 class KeyIn(Schema):
@@ -102,7 +102,7 @@ class KeyIn(Schema):
 
     model_config = shown({"owner": "a.laboratory", "role": "reader", "surgeons": ["kestrel"]})
 
-    owner: Annotated[str, Field(pattern=OWNER, description="Whose it is; events and releases bear this name.")]
+    owner: Annotated[str, Field(pattern=OWNER, description="The owner's name, which events and releases record.")]
     role: Role
     expires_at: AwareDatetime | None = None
     surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None

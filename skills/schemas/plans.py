@@ -86,15 +86,18 @@ class PlanIn(Schema):
 
     surgeon: SlugField
     suture: SlugField
-    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
+    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = Field(
+        default=None, description="The policy version; by default the released one."
+    )
     suture_points: Annotated[list[SuturePointIn], Field(min_length=1, max_length=MAX_PASSES)]
     starts_mm: Annotated[list[PointIn | None], Field(max_length=MAX_PASSES)] | None = Field(
         default=None,
-        description=f"Up to {MAX_OUTSIDE_MM:g} mm outside a pass's grid world a transfer leads into it.",
+        description="Start of each pass; null is the demonstrated start, moved with the grid. "
+        f"Up to {MAX_OUTSIDE_MM:g} mm outside a pass's grid world a transfer leads into it.",
     )
-    arm: Name | None = None
-    frame: Name | None = None
-    instrument: Name | None = None
+    arm: Name | None = Field(default=None, description="Refused if it is not the demonstrated one.")
+    frame: Name | None = Field(default=None, description="Refused if it is not the frame of the demonstration.")
+    instrument: Name | None = Field(default=None, description="Refused if it is not the demonstrated one.")
     speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = Field(
         default=20.0,
         description="Greatest speed of the tip: the surgeon's tempo is slowed to it, all along the pass alike. At most "
@@ -110,7 +113,9 @@ class PlanIn(Schema):
         description="recorded: A2 ends in the demonstrated hand-off, in the poses of both arms; paper: PSM_A turns "
         "across PSM_M's approach. By default recorded where both poses were, unless psm_m gives another approach.",
     )
-    rate_hz: Annotated[Number, Field(ge=RATE_HZ[0], le=RATE_HZ[1])] = 200.0
+    rate_hz: Annotated[Number, Field(ge=RATE_HZ[0], le=RATE_HZ[1])] = Field(
+        default=200.0, description=f"Samples per second, {RATE_HZ[0]:g} to {RATE_HZ[1]:g}."
+    )
     tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
         default=0.0,
         description=f"How far down the jaw's approach from its hinge suture points and starts are meant; "

@@ -32,7 +32,9 @@ class ReachIn(Schema):
 
     surgeon: SlugField
     suture: SlugField
-    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
+    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = Field(
+        default=None, description="The policy version; by default the released one."
+    )
     centre_mm: PointIn | None = Field(
         default=None, description="Middle of the box, in the frame of the arm; left out, the demonstrated goal."
     )
@@ -47,14 +49,16 @@ class ReachIn(Schema):
         description="Rotations of the grid world about each place, as of a suture point.",
     )
     orientation: Turning | None = Field(default=None, description="As in a plan; so are all that follow.")
-    a2: A2Target | None = None
+    a2: A2Target | None = Field(default=None, description="As in a plan.")
     tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
         default=0.0, description=f"{JAW_TIP_MM:g} for the finger tips."
     )
-    psm_m: PsmMIn | None = None
-    scene: SceneIn | None = None
-    tissue_mm: Coordinate | None = None
-    handoff: Literal["none"] | None = None
+    psm_m: PsmMIn | None = Field(default=None, description="As in a plan.")
+    scene: SceneIn | None = Field(default=None, description="As in a plan.")
+    tissue_mm: Coordinate | None = Field(
+        default=None, description="Height of level tissue along z of the arm's frame, as in a plan."
+    )
+    handoff: Literal["none"] | None = Field(default=None, description="none maps A1 alone, without a hand-off.")
 
     def plan_at(self, position_mm: PointIn) -> PlanIn:
         """Return the request of a plan with one pass at this place for each rotation."""

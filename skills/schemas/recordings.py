@@ -175,7 +175,7 @@ class ContentLists(Given):
     dropped: list[Dropped] = Field(description="Topics with samples whose stamps went back.")
     setpoints: list[Setpoints] = Field(description="Commanded poses and jaws; nothing is learnt from them.")
     base_frames: list[BaseFrame]
-    identifications: list[ArmIdentification] = Field(description="What joints recorded beside poses show.")
+    identifications: list[ArmIdentification] = Field(description="Arms identified from joints recorded beside poses.")
 
 
 class RecordingContent(ContentLists):
@@ -192,7 +192,7 @@ class Described(Given):
     size_bytes: Count
     media_type: str
     format: str = Field(description=f"One of {', '.join(get_args(Format))}.")
-    integrity: Literal["full", "partial", "none"] = Field(description="How much of it a checksum vouches for.")
+    integrity: Literal["full", "partial", "none"] = Field(description="The part of it that checksums cover.")
 
 
 class Recording(Described, RecordingContent):
@@ -289,7 +289,7 @@ class TableIn(Schema):
 
 
 class StatedIn(TableIn):
-    """What a folder's owner states about recordings for `skills recording table` (docs/recordings.md)."""
+    """Statements of a folder's owner about recordings for `skills recording table` (docs/recordings.md)."""
 
     source: Text = ""
     episode: Name | None = None

@@ -93,7 +93,7 @@ class CurvePoint(Given):
 
     demo: Sha256
     session: Slug | None
-    stored_at: datetime = Field(description="When its recording was stored.")
+    stored_at: datetime = Field(description="Of its recording.")
     distance_mm: float
     duration_s: float | None
     log_dimensionless_jerk: float | None
@@ -103,7 +103,7 @@ class SessionFigures(Given):
     """The demonstrations of one session, compared with the same reference: their medians."""
 
     session: Slug | None = Field(description="null if the recording has no session name; it is then one of its own.")
-    stored_at: datetime = Field(description="When its first recording was stored.")
+    stored_at: datetime = Field(description="Of its first recording.")
     demos: Count
     distance_mm: float
     duration_s: float | None

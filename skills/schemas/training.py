@@ -45,11 +45,23 @@ class TrainingIn(Schema):
 
     surgeon: SlugField
     suture: SlugField
-    demos: list[DigestField] | None = None
+    demos: list[DigestField] | None = Field(
+        default=None,
+        description="The demonstrations to learn from; by default the newest one that is active and not marked "
+        "recovery or failure.",
+    )
     combine: CombineIn | None = None
-    learner: LearnerIn | None = None
-    seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = 0
-    release: StrictBool = False
+    learner: LearnerIn | None = Field(
+        default=None, description="Its kind and settings; by default Q-learning in the phase state."
+    )
+    seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = Field(
+        default=0, description="Seed of the random numbers; the phase learner's result is independent of it."
+    )
+    release: StrictBool = Field(
+        default=False,
+        description="Release the version if it passes the gate; also if an equal training is done already and its "
+        "version is not the one that the style serves now.",
+    )
     outcomes: Literal["success", "any"] = Field(
         default="success",
         description="success refuses demonstrations that are marked recovery or failure; any learns from them too.",
@@ -92,14 +104,16 @@ class RetrainingIn(Schema):
 
     model_config = shown({}, {"surgeon": "kestrel", "only_stale": True, "release": True})
 
-    surgeon: SlugField | None = None
-    suture: SlugField | None = None
+    surgeon: SlugField | None = Field(default=None, description="Only of this surgeon.")
+    suture: SlugField | None = Field(default=None, description="Only of this suture type.")
     only_stale: StrictBool = Field(
         default=False,
         description="Leaves out every style whose newest version is what this would make of it: learnt from its newest "
         "demonstration, with these settings, by this version of the learner, under this gate's limits.",
     )
-    learner: LearnerIn | None = None
+    learner: LearnerIn | None = Field(
+        default=None, description="Its kind and settings; by default Q-learning in the phase state."
+    )
     release: StrictBool = Field(
         default=False, description="Releases a version that passes the gate and is not worse than the released one."
     )

@@ -191,7 +191,7 @@ def test_marking_a_demonstration_as_a_failure_withdraws_what_rests_on_it(trained
     for demos in (None, [demo["id"]]):
         with pytest.raises(Problem, match="outcomes='any'") as refused:
             trained.client.train(**KESTREL, demos=demos, seed=5)
-        assert refused.value.body["remedies"] == [{"action": "train-any"}]
+        assert refused.value.document.remedies == [{"action": "train-any"}]
     with pytest.raises(Problem, match="its demonstration was marked failure"):
         trained.client.release(**KESTREL, version=1)
     job = trained.train(outcomes="any", release=True)

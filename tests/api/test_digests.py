@@ -54,6 +54,6 @@ def test_a_beginning_that_several_share_lists_them(trained: Service):
     with pytest.raises(Problem) as refused:
         trained.client.demo(one[:20])
     assert (refused.value.status, refused.value.kind) == (422, "ambiguous-digest")
-    assert sorted(refused.value.body["numbers"]["candidates"]) == sorted([one, twin])
+    assert sorted(refused.value.numbers["candidates"]) == sorted([one, twin])
     assert one in str(refused.value) and twin in str(refused.value) and "Give more" in str(refused.value)
     assert trained.client.demo(one)["id"] == one

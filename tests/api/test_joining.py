@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from skills.client.policies import rebuilt
 from skills.errors import Corrupt
 from skills.learning.policy import rollout_from
 from tests.api.service import KESTREL, POLICY, Service, assert_problem
+from tests.client.peers import rebuilt
 from tests.gridworld.paths import follow
 
 NPZ = {"Accept": "application/x-npz"}

@@ -9,7 +9,8 @@ import numpy as np
 import orjson
 import pytest
 
-from skills.client import Client, Problem
+from skills.client import Problem
+from skills.client.blocking.client import Client
 from skills.errors import BadSettings
 from skills.gridworld.reward import sparse_reward
 from skills.learning.policy import learn_tabular, learner_of
@@ -105,7 +106,7 @@ def test_above_its_limit_the_json_has_the_actions_of_the_domain_alone(tmp_path, 
     with serving(copy_of_trained(tmp_path)) as service:
         policy = service.client.policy(**KESTREL)
         entries = policy["phases"] * policy["coverage"]["n_states"]
-        monkeypatch.setattr("skills.library.policies.versions.MAX_JSON_ACTIONS", entries - 1)
+        monkeypatch.setattr("skills.schemas.policy_document.MAX_JSON_ACTIONS", entries - 1)
         served = service.http.get(f"/policy-versions/{policy['sha256']}").json()
         assert served["actions"] is None
         assert "live_actions" not in policy

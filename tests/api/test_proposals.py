@@ -47,7 +47,7 @@ def test_proposals_are_listed_accepted_rejected_and_opened_again(service: Servic
 def test_commands_list_accept_correct_and_reject(service: Service, monkeypatch: pytest.MonkeyPatch):
     service.client.put_surgeon("kestrel")
     recording = service.client.add_recording(FIVE.data)["id"]
-    monkeypatch.setattr("skills.cli.demos.service", lambda: nullcontext(Client(service.http)))
+    monkeypatch.setattr("skills.cli.recordings.service", lambda: nullcontext(Client(service.http)))
 
     def run(*words: str) -> str:
         done = CliRunner().invoke(app, ["proposal", *words])

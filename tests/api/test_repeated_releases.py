@@ -5,8 +5,9 @@ from typing import Any
 import httpx2 as httpx
 import pytest
 
-from skills.client import Client, Retrying
-from skills.client.connection import NotReached
+from skills.client.blocking.client import Client
+from skills.client.problems import NotReached
+from skills.client.retrying import Retrying
 from skills.library.policies import releases
 from skills.library.policies.versions import list_versions
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem

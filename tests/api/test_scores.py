@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skills.library.comparison.calibrations import calibrate_on, keep, read_cohort
+from skills.library.comparison.calibrations import calibrate_on, put_calibration, read_cohort
 from skills.seeds.recordings import sample_recordings
 from tests import backends
 from tests.api.keyed import As, key
@@ -38,7 +38,7 @@ def scoring(tmp_path_factory: pytest.TempPathFactory, stored: dict[str, str]) ->
         about = {"surgeon": "plover", "suture": cases.SUTURE, "arm": "PSM_right", "start_s": 1.0, "end_s": 4.0}
         stored["trial"] = service.client.add_demo(trial, media_type="text/plain", **about)["id"]
         with service.database.writing() as session:
-            keep(session, calibrate_on(read_cohort(rated.folder(folder / "lab")), permutations=39), "test")
+            put_calibration(session, calibrate_on(read_cohort(rated.folder(folder / "lab")), permutations=39), "test")
         yield service
 
 

@@ -21,6 +21,7 @@ from skills.db.packed import pack
 from skills.db.session import Database
 from skills.library.comparison.atlas import atlas_of
 from skills.packing import sha256
+from skills.schemas.recordings import TableIn
 from tests import backends
 from tests.comparison.cohort import Cohort, cohort
 from tests.library import cases, cohorts
@@ -82,7 +83,7 @@ def fill(database: Database, drawn: Cohort, until: int) -> None:
             if digest in there:
                 continue
             recording = {"sha256": digest, "size_bytes": 0, "media_type": "text/csv", "format": "table"}
-            more = {"integrity": "full", "reading": {}, "about": {}, "created_at": now()}
+            more = {"integrity": "full", "reading": TableIn(), "about": model.recording.about, "created_at": now()}
             row = session.execute(insert(StoredRecording).returning(StoredRecording.row), recording | more).scalar_one()
             session.execute(
                 insert(Demonstration),
@@ -94,14 +95,13 @@ def fill(database: Database, drawn: Cohort, until: int) -> None:
                     "session": str(drawn.sessions[one]),
                     "demo": pack(drawn.demos[one]),
                     "path": pack(model.path),
-                    "report": {},
                     "created_at": now(),
                     **{name: getattr(model, name) for name in SAME},
                 },
             )
 
 
-SAME = ("arm", "topic", "frame", "instrument", "start_s", "end_s", "hysteresis")
+SAME = ("arm", "topic", "frame", "instrument", "start_s", "end_s", "hysteresis", "report", "segment")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from skills.db.packed import pack
 from skills.db.session import Database
 from skills.library.comparison.neighbours import nearest_to
 from skills.packing import sha256
+from skills.schemas.recordings import TableIn
 from tests import backends
 from tests.bench import recognition
 from tests.bench.atlas import SAME, timed
@@ -119,12 +120,12 @@ def fill(database: Database, real: np.ndarray) -> list[str]:
     rng, nothing = np.random.default_rng(1), (np.empty(0, np.int64), np.empty(0), np.empty(0))
     with database.reading() as session:
         model = session.get_one(Demonstration, stored.row)
-        demo, path = pack(model.demo), pack(model.path)
+        demo, path, about = pack(model.demo), pack(model.path), model.recording.about
         surgeons = [row for (row,) in session.execute(select(Surgeon.row).order_by(Surgeon.slug))]
     names = [sha256(f"{one}".encode()) for one in range(MANY)]
     for at in range(0, MANY, AT_ONCE):
         some, first = names[at : at + AT_ONCE], stored.row + 1 + at
-        shared = {"reading": {}, "about": {}, "integrity": "full", "created_at": now()}
+        shared = {"reading": TableIn(), "about": about, "integrity": "full", "created_at": now()}
         recordings = [
             {"row": first + k, "sha256": name, "size_bytes": 0, "media_type": "text/csv", "format": "table", **shared}
             for k, name in enumerate(some)
@@ -140,7 +141,6 @@ def fill(database: Database, real: np.ndarray) -> list[str]:
                 "session": None,
                 "demo": demo,
                 "path": path,
-                "report": {},
                 "created_at": now(),
                 **same,
             }

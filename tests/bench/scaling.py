@@ -23,7 +23,7 @@ from skills.jobs.watch import Leases, Watch
 from skills.library.operation import jobs
 from skills.library.operation.installation import condition_of, count_jobs
 from skills.library.operation.jobs import BATCH
-from skills.library.people import catalogue
+from skills.library.people import surgeons
 from skills.library.policies import versions
 from skills.library.policies.retraining import choose_styles, list_styles
 from skills.library.policies.training import request_training
@@ -133,11 +133,11 @@ def compare(table: Table, name: str, small: Work, large: Work) -> None:
 
 def last_page(session: Session, _style: Style) -> object:
     last = session.scalar(text("SELECT max(slug) FROM surgeons"))
-    return catalogue.list_surgeons(session, PAGE, f"surgeon-{int(last.split('-')[1]) - PAGE:04}")
+    return surgeons.list_surgeons(session, PAGE, f"surgeon-{int(last.split('-')[1]) - PAGE:04}")
 
 
 def newest(session: Session, style: Style) -> Demonstration | None:
-    return demos.newest_demo(session, catalogue.find_surgeon(session, style[0]).row, style[1])
+    return demos.newest_demo(session, surgeons.find_surgeon(session, style[0]).row, style[1])
 
 
 def encoded(session: Session, style: Style, media_type: str) -> object:
@@ -150,9 +150,9 @@ def last_batch(session: Session) -> Job:
 
 
 CALLS: dict[str, Call] = {
-    "surgeons, the first page": lambda s, _: catalogue.list_surgeons(s, PAGE, None),
+    "surgeons, the first page": lambda s, _: surgeons.list_surgeons(s, PAGE, None),
     "surgeons, the last page": last_page,
-    "a surgeon": lambda s, style: catalogue.find_surgeon(s, style[0]),
+    "a surgeon": lambda s, style: surgeons.find_surgeon(s, style[0]),
     "demonstrations, the first page": lambda s, _: demos.list_demos(s, PAGE, None, None, None),
     "demonstrations, the last page": lambda s, _: demos.list_demos(s, PAGE, PAGE, None, None),
     "demonstrations of a surgeon": lambda s, style: demos.list_demos(s, PAGE, None, style[0], None),

@@ -1,18 +1,30 @@
 """Stand-ins for the client's environment: a scripted service, and a clock that advances only on sleep."""
 
 import asyncio
+import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import httpx2 as httpx
 
-from skills.client import AsyncClient, Client, Retrying
+from skills.client.blocking.client import Client
+from skills.client.client import AsyncClient
+from skills.client.retrying import Retrying
+from skills.client.verifying import rebuild_policy
+from skills.learning.policy import Policy
 
 ADDRESS = "http://127.0.0.1:9"
 SURGEON = {
     **{"surgeon": "kestrel", "skill_level": "expert", "handedness": None, "protocol": None, "consent": None},
     "created_at": "2026-01-02T03:04:05Z",
 }
+
+
+def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> Policy:
+    """Return a policy as the client rebuilds and verifies it, from the JSON of the service."""
+    return rebuild_policy(json.dumps(about).encode(), arrays, json.dumps(demo).encode())
+
+
 Outcome = httpx.Response | Exception
 
 

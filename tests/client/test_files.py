@@ -10,13 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skills.client import NotReached, Problem
-from skills.client.transport import PIECE_BYTES
+from skills.client import Problem
+from skills.client.files import CHUNK_BYTES
+from skills.client.problems import NotReached
 from skills.errors import Corrupt
 from tests.client.peers import BOTH, Script, Time, answer, refusal
 
 both = pytest.mark.parametrize("made", BOTH)
-BAG = os.urandom(3 * PIECE_BYTES + 17)
+BAG = os.urandom(3 * CHUNK_BYTES + 17)
 CUT = httpx.RemoteProtocolError("peer closed connection without sending complete message body")
 
 
@@ -87,7 +88,7 @@ def test_an_upload_whose_line_breaks_is_sent_again_from_its_beginning(made, tmp_
     assert refused.value.status == 413
     assert script.bodies == [data] * 3
     assert {one.headers["content-digest"] for one in script.asked} == {script.asked[0].headers["content-digest"]}
-    once = [(went, len(data)) for went in (PIECE_BYTES, 2 * PIECE_BYTES, len(data))]
+    once = [(went, len(data)) for went in (CHUNK_BYTES, 2 * CHUNK_BYTES, len(data))]
     assert told == once * 3
 
 

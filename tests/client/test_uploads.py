@@ -8,10 +8,11 @@ from pathlib import Path
 import httpx2 as httpx
 import pytest
 
-from skills.client import Client
-from skills.client.transport import PIECE_BYTES
+from skills.client.blocking.client import Client
+from skills.client.files import CHUNK_BYTES
 from skills.errors import UnknownFormat, UnreadableRecording
-from skills.formats import MEDIA_TYPES, write_mcap
+from skills.formats import MEDIA_TYPES
+from skills.formats.bag_writer import write_mcap
 from tests.formats import bags, others, trials
 
 
@@ -57,7 +58,7 @@ def test_a_large_file_is_sent_piece_by_piece_with_its_length_and_digest(client, 
     assert heard.headers["content-digest"] == f"sha-256=:{digest}:"
     assert "transfer-encoding" not in heard.headers
     assert heard.body == data
-    assert max(heard.pieces) <= PIECE_BYTES
+    assert max(heard.pieces) <= CHUNK_BYTES
     assert told == [(sum(heard.pieces[: n + 1]), len(data)) for n in range(len(heard.pieces))]
 
 

@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import skills
-from skills.client import Client
-from skills.client.policies import rebuilt
+from skills.client.blocking.client import Client
 from skills.errors import BadInput, Corrupt
-from skills.library.policies import versions
+from skills.schemas import policy_document
 from tests.api.service import KESTREL, POLICY
+from tests.client.peers import rebuilt
 from tests.library import cases
 
 Fetched = tuple[dict[str, Any], bytes, dict[str, Any]]
@@ -88,8 +88,8 @@ def test_nothing_that_is_said_of_it_can_be_changed(fetched: Fetched, of: int):
 def test_no_live_action_of_a_large_policy_can_be_changed(fetched: Fetched, monkeypatch: pytest.MonkeyPatch):
     about, arrays, demo = fetched
     policy = rebuilt(about, arrays, demo)
-    monkeypatch.setattr(versions, "MAX_JSON_ACTIONS", 0)
-    live = versions.live_actions_of(policy)
+    monkeypatch.setattr(policy_document, "MAX_JSON_ACTIONS", 0)
+    live = policy_document.live_actions_of(policy)
     large = about | {"actions": None, "live_actions": live}
     rebuilt(large, arrays, demo)
     for path in (("live_actions", 1, "low", 0), ("live_actions", 1, "size", 2), ("live_actions", 2, "actions", 7)):

@@ -22,12 +22,14 @@ from skills.db.models import (
     StoredPlayback,
 )
 from skills.db.session import Database
-from skills.library.people.keys import Lasts, create_key, sign_in
+from skills.library.people.keys import create_key
+from skills.library.people.sign_ins import SignInLifetime, sign_in
 from skills.verification.playback import Pictures
 from tests import backends
 from tests.db.test_packed import PLAYBACK
 from tests.library import cases
 from tests.library.styles import retrain
+from tests.library.test_scores import calibration
 
 FROZEN = (
     "recordings",
@@ -86,7 +88,7 @@ def fill(database: Database) -> None:
         session.add(played)
         session.flush()
         session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
-        session.add(StoredCalibration(sha256="0" * 64, about={}))
+        session.add(StoredCalibration(sha256="0" * 64, about=calibration("Suturing")))
         session.add(DemonstrationOutcome(demonstration_row=demo.row, outcome="failure", reason="fell", actor="ada"))
         session.add(ProposalMark(recording_row=demo.recording_row, number=1, state="rejected", actor="ada"))
         job = service_tables.Job(id="0" * 16, kind="dataset", identity="0" * 64, request={})
@@ -105,7 +107,7 @@ def fill(database: Database) -> None:
         shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]), np.ones(3))
         session.add(MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))
         key, _ = create_key(session, "ada", "reader", "test", surgeons=["kestrel"])
-        sign_in(session, key.id, Lasts(60.0, 600.0))
+        sign_in(session, key.id, SignInLifetime(60.0, 600.0))
 
 
 COLUMNS = [(table, column.name) for table in FROZEN for column in Base.metadata.tables[table].columns]
@@ -135,7 +137,7 @@ def changed(column: str) -> str:
         return f"{column} + 0.25"
     if column.endswith("_at"):
         return f"{column} + interval '1 second'"
-    return {"demo": "'\\x00'", "path": "'\\x00'", "report": "'{}'"}.get(column, "'other'")
+    return {"demo": "'\\x00'", "path": "'\\x00'", "report": "'{}'", "segment": "'{}'"}.get(column, "'other'")
 
 
 @pytest.mark.parametrize("table", WITHDRAWABLE)

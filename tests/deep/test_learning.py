@@ -85,7 +85,7 @@ def test_how_far_it_is_is_told_and_whoever_raises_there_ends_it():
             raise Conflict("enough")
 
     with pytest.raises(Conflict, match="enough"):
-        skills.learn_policy(REWARD, DQN(steps=10_000_000), tell=tell)
+        skills.learn_policy(REWARD, DQN(steps=10_000_000), progress=tell)
     assert 0 < told[-1] < 0.5
 
 

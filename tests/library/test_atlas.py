@@ -15,13 +15,13 @@ from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import dtw
-from skills.library.comparison import atlas
-from skills.library.comparison import measured as cache
+from skills.library.comparison import atlas, measuring
 from skills.library.comparison.atlas import atlas_of
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.releases import withdraw
 from skills.library.recordings.demos import withdraw_demo
+from skills.schemas.comparison import Atlas
 from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.comparison.cohort import cohort
@@ -44,13 +44,13 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
 def measured(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list that records how many pairs each call measures."""
     counted: list[int] = []
-    really = cache.distances_of
+    really = measuring.distances_of
 
     def count(shapes, pairs):
         counted.append(len(pairs))
         return really(shapes, pairs)
 
-    monkeypatch.setattr(cache, "distances_of", count)
+    monkeypatch.setattr(measuring, "distances_of", count)
     return counted
 
 
@@ -64,7 +64,7 @@ def kept(database: Database) -> dict[int, str]:
         return {row.demonstration_row: digest(row.measured) for row in session.scalars(select(MeasuredShape))}
 
 
-def far(found: atlas.Atlas) -> np.ndarray:
+def far(found: Atlas) -> np.ndarray:
     size = len(found.demos)
     whole = np.zeros((size, size))
     for at, row in enumerate(found.distances):
@@ -88,7 +88,7 @@ def test_eight_surgeons_in_five_sessions_are_recognised_and_told_apart(database:
     assert seen.log_loss < 0.5 * seen.log_loss_of_guessing == pytest.approx(0.5 * np.log(8))
     assert [one.demos for one in seen.curve] == [8] * 5 and seen.stranger_if_known < seen.stranger_if_left_out
     assert found.votes is not None and (found.votes.recordings, found.votes.right) == (40, seen.right)
-    whose = atlas_of(database, SUTURE, demo=names[12]).whose
+    whose = atlas_of(database, SUTURE, demo=names[12]).recognised
     assert whose is not None
     assert (whose.arm, whose.surgeon, whose.likely[0].surgeon) == ("PSM", cohorts.name(2), cohorts.name(2))
     assert sum(one.probability for one in whose.likely) == pytest.approx(1.0)
@@ -163,7 +163,7 @@ def test_the_shape_cache_may_be_dropped_and_other_versions_are_ignored(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     assert atlas_of(database, SUTURE) == first
-    monkeypatch.setattr(cache, "VERSION", 0)
+    monkeypatch.setattr(measuring, "VERSION", 0)
     assert atlas_of(database, SUTURE) == first
     assert measured == [6, 6] * 3
     with database.reading() as session:
@@ -179,15 +179,15 @@ def test_it_is_measured_in_blocks_and_kept_block_by_block(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     measured.clear()
-    monkeypatch.setattr(cache, "PAIRS_AT_ONCE", 10)
-    monkeypatch.setattr(cache, "DEMOS_AT_ONCE", 2)
+    monkeypatch.setattr(measuring, "PAIRS_AT_ONCE", 10)
+    monkeypatch.setattr(measuring, "DEMOS_AT_ONCE", 2)
     assert atlas_of(database, SUTURE) == whole
     assert sum(measured) == 2 * 36 and len(measured) > 4
 
 
 def test_two_that_ask_at_once_measure_once(database: Database, measured: list[int]):
     small(database)
-    found: list[atlas.Atlas] = []
+    found: list[Atlas] = []
     threads = [Thread(target=lambda: found.append(atlas_of(database, SUTURE))) for _ in range(4)]
     for thread in threads:
         thread.start()
@@ -360,7 +360,7 @@ def test_erasure_leaves_nothing(database: Database, whole: bool):
 
 def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, monkeypatch: pytest.MonkeyPatch):
     names = small(database)
-    really = cache.distances_of
+    really = measuring.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -368,7 +368,7 @@ def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, mon
                 erase_surgeon(session, cohorts.name(0), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(cache, "distances_of", erase_first)
+    monkeypatch.setattr(measuring, "distances_of", erase_first)
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names[2:]
     with database.reading() as session:
         there = {*session.scalars(select(Demonstration.row))}

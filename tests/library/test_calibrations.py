@@ -1,8 +1,7 @@
 """Calibration on a folder in the layout of JIGSAWS: a cohort of known truth, and invalid folders."""
 
-import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,14 @@ from skills.library.comparison.calibrations import (
     Rated,
     accepted,
     calibrate_on,
-    keep,
+    digest_of,
     newest,
+    put_calibration,
     read_calibration,
     read_cohort,
 )
 from skills.library.operation.inspection import inspect_installation
-from skills.packing import canonical, sha256
+from skills.schemas.calibrations import Calibration
 from skills.scoring.calibration import as_numbers, held_out, rank_correlations
 from skills.scoring.validation import refusals, shuffled
 from tests.formats.trials import kinematics
@@ -47,7 +47,7 @@ def read(folder: Path) -> Rated:
 
 
 @pytest.fixture(scope="module")
-def about(read: Rated) -> dict[str, Any]:
+def about(read: Rated) -> Calibration:
     return calibrate_on(read, permutations=39)
 
 
@@ -64,11 +64,11 @@ def copied(small: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.nightly  # by day tests/scoring/test_validation.py
-def test_eight_surgeons_are_rated_well_by_a_model_that_has_not_seen_them(read: Rated, about: dict[str, Any]) -> None:
-    judged = about["validated"]["tasks"]["Suturing"]
+def test_eight_surgeons_are_rated_well_by_a_model_that_has_not_seen_them(read: Rated, about: Calibration) -> None:
+    judged = asdict(about.validated.tasks["Suturing"])
     print(judged)
-    assert read.data["surgeons"] == 8 and read.data["trials"] == judged["trials"] == 40
-    assert read.data["tasks"]["Suturing"]["levels"] == {"novice": 15, "intermediate": 10, "expert": 15}
+    assert read.data.surgeons == 8 and read.data.trials == judged["trials"] == 40
+    assert read.data.tasks["Suturing"].levels == {"novice": 15, "intermediate": 10, "expert": 15}
     assert judged["model"]["rho"] > 0.9 and judged["model"]["rho_interval"][0] > 0.6
     assert judged["model"]["accuracy"] > judged["chance"]["commonest"]
     assert judged["over_duration"][0] > 0.1
@@ -87,33 +87,33 @@ def test_other_cohorts_are_rated_as_well(tmp_path: Path) -> None:
     assert min(rhos) > 0.85
 
 
-def test_what_is_kept_is_plain_and_names_nobody(read: Rated, about: dict[str, Any]) -> None:
-    written = json.dumps(about)
+def test_what_is_kept_is_plain_and_names_nobody(read: Rated, about: Calibration) -> None:
+    written = about.model_dump_json()
     assert "Suturing_" not in written and ".txt" not in written
-    assert len(about["data"]["files"]) == 41 and all(len(digest) == 64 for digest in about["data"]["files"])
-    assert set(about["versions"]) == {"suture-skills", "scipy", "numpy"}
+    assert len(about.data.files) == 41 and all(len(digest) == 64 for digest in about.data.files)
+    assert set(about.versions) == {"suture-skills", "scipy", "numpy"}
     assert calibrate_on(read, permutations=39) == about  # identical to the last bit
 
 
-def test_the_newest_is_used_and_an_equal_one_is_not_kept_again(database: Database, about: dict[str, Any]) -> None:
+def test_the_newest_is_used_and_an_equal_one_is_not_kept_again(database: Database, about: Calibration) -> None:
     with database.writing() as session:
         assert newest(session) is None
-        first, new = keep(session, about, "test")
+        first, new = put_calibration(session, about, "test")
         assert new
-        assert keep(session, about, "test") == (first, False)
-        other, new = keep(session, about | {"settings": {}}, "test")
+        assert put_calibration(session, about, "test") == (first, False)
+        other, new = put_calibration(session, about.model_copy(update={"versions": {}}), "test")
         assert new
     with database.writing() as session:
         assert newest(session).sha256 == other.sha256
-        again, new = keep(session, about, "test")  # of older numbers, and in use again
+        again, new = put_calibration(session, about, "test")  # of older numbers, and in use again
         assert new
         assert newest(session).row == again.row
         assert as_numbers(read_calibration(again)) == as_numbers(read_calibration(first))
 
 
-def test_a_calibration_cannot_be_changed_and_damage_is_found(database: Database, about: dict[str, Any]) -> None:
+def test_a_calibration_cannot_be_changed_and_damage_is_found(database: Database, about: Calibration) -> None:
     with database.writing() as session:
-        keep(session, about, "test")
+        put_calibration(session, about, "test")
     assert not wrong(database)
     with pytest.raises(DatabaseError, match="append-only"), database.writing() as session:
         session.execute(text("UPDATE calibrations SET sha256 = '0'"))
@@ -140,9 +140,9 @@ def test_an_empty_folder_says_what_is_expected(tmp_path: Path) -> None:
 def test_all_tasks_are_read_or_those_that_are_named(copied: Path) -> None:
     rated.folder(copied, task="Knot_Tying", count=5, trials=1)
     both = read_cohort(copied)
-    assert both.cohort.names == ("Knot_Tying", "Suturing") and both.data["trials"] == 15
-    assert both.data["surgeons"] == 5  # a letter is one surgeon in both
-    assert read_cohort(copied, tasks=["Suturing"]).data["trials"] == 10
+    assert both.cohort.names == ("Knot_Tying", "Suturing") and both.data.trials == 15
+    assert both.data.surgeons == 5  # a letter is one surgeon in both
+    assert read_cohort(copied, tasks=["Suturing"]).data.trials == 10
     with pytest.raises(BadInput, match="has trials of Knot_Tying, Suturing, not of Sewing"):
         read_cohort(copied, tasks=["Suturing", "Sewing"])
 
@@ -167,7 +167,7 @@ def test_names_that_do_not_match_are_named(copied: Path) -> None:
         "rated, but without a kinematics file": ["Suturing_B901"],
         "unrated": ["Suturing_B001"],
     }
-    assert (found.data["trials"], found.data["left_out"]) == (9, 1)
+    assert (found.data.trials, found.data.left_out) == (9, 1)
     meta.write_text("")
     with pytest.raises(BadInput, match="10 of 10 trials: Suturing_B001"):
         read_cohort(copied)
@@ -223,14 +223,14 @@ def test_an_empty_trial_is_left_out_and_named(copied: Path) -> None:
     (copied / "Suturing/kinematics/AllGestures/Suturing_C002.txt").write_bytes(b"")
     found = read_cohort(copied)
     assert found.left_out == {"empty": ["Suturing_C002"]}
-    assert (found.data["trials"], found.data["left_out"]) == (9, 1)
+    assert (found.data.trials, found.data.left_out) == (9, 1)
 
 
 # ---- accepted models ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def unknowable(read: Rated) -> dict[str, Any]:
+def unknowable(read: Rated) -> Calibration:
     """Return a model of ratings that were shuffled among the surgeons."""
     order = shuffled(read.cohort, np.random.default_rng(1))
     dealt = replace(read.cohort, ratings=read.cohort.ratings[order], levels=read.cohort.levels[order])
@@ -238,55 +238,47 @@ def unknowable(read: Rated) -> dict[str, Any]:
 
 
 def test_a_model_of_what_cannot_be_known_is_refused_and_nothing_is_stored(
-    database: Database, unknowable: dict[str, Any]
+    database: Database, unknowable: Calibration
 ) -> None:
-    assert unknowable["validated"]["mean"]["model"]["rho"] < 0.5
+    assert unknowable.validated.mean.model.rho < 0.5
     said = r"not accepted, and nothing was stored\. Suturing: .*p = .*There are 8 surgeons.*about 40 with 5 trials"
     with pytest.raises(BadInput, match=said), database.writing() as session:
-        keep(session, unknowable, "test")
+        put_calibration(session, unknowable, "test")
     with database.reading() as session:
         assert newest(session) is None
 
 
 def test_one_rated_task_of_two_is_enough_to_be_kept(
-    database: Database, about: dict[str, Any], unknowable: dict[str, Any]
+    database: Database, about: Calibration, unknowable: Calibration
 ) -> None:
-    judged = about["validated"]
-    tasks = {"Knot_Tying": unknowable["validated"]["tasks"]["Suturing"], **judged["tasks"]}
-    both = about | {"validated": judged | {"tasks": tasks}}
-    assert refusals(tasks["Knot_Tying"]) and accepted(both) == ["Suturing"]
+    tasks = {"Knot_Tying": unknowable.validated.tasks["Suturing"], **about.validated.tasks}
+    both = about.model_copy(update={"validated": replace(about.validated, tasks=tasks)})
+    assert refusals(asdict(tasks["Knot_Tying"])) and accepted(both) == ["Suturing"]
     with database.writing() as session:
-        assert keep(session, both, "test")[1]
+        assert put_calibration(session, both, "test")[1]
 
 
-OLD = {  # shortened
-    "version": VERSION - 1,
-    "model": {"figures": ["duration_s"], "centre": [10.0], "scale": [2.0], "rating": 18.0, "rating_weights": [-3.0]},
-    "data": {"task": "Suturing", "of": "hand-off"},
-    "validated": {"all_figures": {"rho": 0.9}},
-}
-
-
-def test_a_calibration_of_an_older_version_is_whole_and_not_used(database: Database) -> None:
+def test_a_calibration_of_another_version_is_whole_and_not_used(database: Database, about: Calibration) -> None:
+    other = about.model_copy(update={"version": VERSION - 1})
     with database.writing() as session:
-        session.add(StoredCalibration(sha256=sha256(canonical(OLD)), about=OLD))
+        session.add(StoredCalibration(sha256=digest_of(other), about=other))
     with database.reading() as session:
         assert read_calibration(newest(session)) is None
     assert not wrong(database)
 
 
-def test_a_calibration_of_other_figures_is_not_used(database: Database, about: dict[str, Any]) -> None:
+def test_a_calibration_of_other_figures_is_not_used(database: Database, about: Calibration) -> None:
     """The figures are told apart by their order, so a model of others would rate anything."""
-    other = about | {"model": about["model"] | {"figures": about["model"]["figures"][::-1]}}
+    other = about.model_copy(update={"model": about.model | {"figures": about.model["figures"][::-1]}})
     with database.writing() as session:
-        assert read_calibration(keep(session, about, "test")[0]) is not None
-        assert read_calibration(keep(session, other, "test")[0]) is None
+        assert read_calibration(put_calibration(session, about, "test")[0]) is not None
+        assert read_calibration(put_calibration(session, other, "test")[0]) is None
 
 
-def test_numbers_that_are_no_model_are_damage(database: Database, about: dict[str, Any]) -> None:
-    spoilt = about | {"model": about["model"] | {"margins": []}}
+def test_numbers_that_are_no_model_are_damage(database: Database, about: Calibration) -> None:
+    spoilt = about.model_copy(update={"model": about.model | {"margins": []}})
     with database.writing() as session:
-        session.add(StoredCalibration(sha256=sha256(canonical(spoilt)), about=spoilt))
+        session.add(StoredCalibration(sha256=digest_of(spoilt), about=spoilt))
     with database.reading() as session, pytest.raises(Corrupt, match="are no model"):
         read_calibration(newest(session))
     assert wrong(database)
@@ -297,7 +289,7 @@ def test_trials_that_are_too_short_are_left_out_and_named(copied: Path) -> None:
     names[0].write_bytes(as_text(kinematics(60)))
     found = read_cohort(copied)
     assert found.left_out == {"too short to be measured": ["Suturing_B001"]}
-    assert (found.data["trials"], found.data["left_out"]) == (9, 1)
+    assert (found.data.trials, found.data.left_out) == (9, 1)
     for name in names:
         name.write_bytes(as_text(kinematics(60)))
     with pytest.raises(BadInput, match="None of 10 trials can be measured"):

@@ -300,7 +300,7 @@ def midway(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], None]) -> None
 
 
 def exports_module() -> Any:
-    from skills.library.recordings.recordings import datasets
+    from skills.library.recordings import datasets
 
     return datasets
 

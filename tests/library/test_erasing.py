@@ -15,7 +15,7 @@ from skills.db.models import Demonstration, MeasuredShape, PolicyVersion, Record
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import Conflict, NotAllowed, NotFound
-from skills.library.comparison import measured
+from skills.library.comparison import measuring
 from skills.library.comparison.atlas import atlas_of
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.operation import sweep
@@ -54,7 +54,7 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
     atlas_of(database, cases.SUTURE)  # the first now has a distance from the third
     agrees(1, ["atlas"])
     agrees(2, [])
-    really = measured.distances_of
+    really = measuring.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -62,13 +62,13 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
                 erase_surgeon(session, cohorts.name(2), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(measured, "distances_of", erase_first)
+    monkeypatch.setattr(measuring, "distances_of", erase_first)
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         there = set(session.scalars(select(Demonstration.row)))
         kept = session.scalars(select(MeasuredShape)).all()
     assert {row for one in kept for row in one.measured.others.tolist()} <= there
-    monkeypatch.setattr(measured, "distances_of", really)
+    monkeypatch.setattr(measuring, "distances_of", really)
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         assert len(session.scalars(select(MeasuredShape)).all()) == 2
@@ -114,13 +114,13 @@ def test_a_recording_is_deleted_by_whoever_sent_it_or_by_an_admin(database: Data
     mine, others = stored(database), stored(database, 2.5, "bert")
     with database.writing() as session:
         with pytest.raises(NotAllowed, match="Another user"):
-            delete_recording(session, others, "anna", anybodys=False)
-        delete_recording(session, mine, "anna", anybodys=False)
+            delete_recording(session, others, "anna", as_admin=False)
+        delete_recording(session, mine, "anna", as_admin=False)
         with pytest.raises(NotFound):
-            delete_recording(session, mine, "anna", anybodys=False)
+            delete_recording(session, mine, "anna", as_admin=False)
     assert recordings(database) == [others]
     with database.writing() as session:
-        delete_recording(session, others, "local", anybodys=True)
+        delete_recording(session, others, "local", as_admin=True)
     assert recordings(database) == []
     assert set(erasures_of(database).ended["recordings"]) == {mine, others}
 
@@ -129,12 +129,12 @@ def test_a_recording_that_somebody_else_sent_as_well_stays_theirs(database: Data
     sent = stored(database, actor="anna")
     assert stored(database, actor="bert") == sent
     with database.writing() as session:
-        delete_recording(session, sent, "anna", anybodys=False)
+        delete_recording(session, sent, "anna", as_admin=False)
     assert recordings(database) == [sent]
     with database.writing() as session, pytest.raises(NotAllowed):
-        delete_recording(session, sent, "anna", anybodys=False)
+        delete_recording(session, sent, "anna", as_admin=False)
     with database.writing() as session:
-        delete_recording(session, sent, "bert", anybodys=False)
+        delete_recording(session, sent, "bert", as_admin=False)
     assert recordings(database) == []
 
 
@@ -145,7 +145,7 @@ def test_a_recording_with_demos_is_kept_until_its_last_demo_is_erased(database: 
     with database.writing() as session:
         withdraw_demo(session, demos[0], "test")
         with pytest.raises(Conflict, match="depend on this recording"):
-            delete_recording(session, sent, "anna", anybodys=True)
+            delete_recording(session, sent, "anna", as_admin=True)
         erase_demo(session, demos[0], "test")
     assert recordings(database) == [sent]
     with database.writing() as session:
@@ -184,7 +184,7 @@ def test_a_deleted_recording_does_not_come_back_with_a_backup(database: Database
     gone, kept = stored(database), stored(database, 2.5)
     back_up(database, tmp_path / "b.zip")
     with database.writing() as session:
-        delete_recording(session, gone, "anna", anybodys=False)
+        delete_recording(session, gone, "anna", as_admin=False)
     restored = Database(backends.blank("sqlite", tmp_path))
     assert restore(restored, tmp_path / "b.zip", erasures_of(database)).recordings_deleted == 1
     assert recordings(restored) == [kept]

@@ -31,7 +31,7 @@ from skills.library.people import erasure
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw
-from skills.library.recordings import recordings
+from skills.library.recordings import content_cache, recordings
 from skills.library.recordings.recordings import stored_recording
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
@@ -473,10 +473,10 @@ def test_a_cache_may_be_emptied_by_hand_and_is_logged_again(database: Database):
 def test_uploads_erasures_and_retentions_in_steps_keep_the_history_whole(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ):
-    for room in (recordings, sweep, erasure):
+    for room in (recordings, content_cache, sweep, erasure):
         monkeypatch.setattr(room, "AT_ONCE_BYTES", 1024)
-    monkeypatch.setattr(recordings, "CHUNK_BYTES", 1024)
-    monkeypatch.setattr(sweep, "CHUNK_BYTES", 1024)
+    for room in (recordings, content_cache, sweep):
+        monkeypatch.setattr(room, "CHUNK_BYTES", 1024)
     monkeypatch.setattr(sweep, "JOBS_AT_ONCE", 2)
     cases.add_demo(database)
     for seed in range(3):

@@ -11,7 +11,7 @@ from skills.db.models import Demonstration, ParsedChunk, RecordingChunk
 from skills.db.packed import Packed
 from skills.db.service_tables import DatasetChunk, Event
 from skills.db.session import Database
-from skills.library.comparison.measured import far_apart
+from skills.library.comparison.measuring import far_apart
 from skills.library.operation import inspection
 from skills.library.operation.inspection import AGREES, WITH_OTHERS, inspect_installation, packed_values
 from tests import backends

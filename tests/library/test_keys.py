@@ -14,24 +14,19 @@ from skills.errors import BadInput, Conflict, NotFound
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.keys import (
     Holder,
-    Lasts,
     about_key,
     create_key,
-    csrf_of,
     digest_of,
     holders_of,
     is_keyless,
     list_keys,
-    note_use,
     refuse_without_keys,
     revoke_key,
-    sign_in,
-    sign_out,
-    signed_in,
 )
+from skills.library.people.sign_ins import SignInLifetime, csrf_of, note_use, sign_in, sign_out, signed_in
 from tests.library import cases
 
-LASTS = Lasts(idle_s=3600, most_s=12 * 3600)
+LASTS = SignInLifetime(idle_s=3600, most_s=12 * 3600)
 
 
 def holder_of(session: Session, key: str) -> Holder | None:

@@ -220,7 +220,7 @@ def test_a_demonstration_is_not_cut_from_a_recording_being_deleted(database: Dat
         in_turn(
             database,
             [locks.recording(sent.sha256)],
-            lambda session: delete_recording(session, sent.sha256, "test", anybodys=True),
+            lambda session: delete_recording(session, sent.sha256, "test", as_admin=True),
             lambda: add_demo(database, sent.sha256, cut, "test"),
         )
     assert counts(database, StoredRecording, Demonstration) == [0, 0]

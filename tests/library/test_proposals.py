@@ -120,7 +120,7 @@ def test_decisions_are_deleted_with_their_recording(five: Database):
         erase_surgeon(session, "kestrel", "anna")
     with five.writing() as session:
         assert session.scalars(select(ProposalMark.recording_row)).all() == [other.recording.row]
-        delete_recording(session, other.recording.sha256, "bert", anybodys=False)
+        delete_recording(session, other.recording.sha256, "bert", as_admin=False)
     with five.reading() as session:
         assert session.scalar(text("SELECT count(*) FROM proposal_marks")) == 0
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select, text, update
 
-from skills.cli.installation import state_of
+from skills.cli.operation import state_of
 from skills.comparison.combining import Corridor
 from skills.db.models import Demonstration, PolicyVersion, StoredPoses
 from skills.db.packed import digest
@@ -23,10 +23,11 @@ from skills.learning.policy import LEARNER_VERSION
 from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation import inspection
 from skills.library.operation.inspection import Checked, inspect_policies
-from skills.library.operation.integrity import demo_identity, policy_identity, poses_identity_of
+from skills.library.operation.integrity import demo_identity, poses_identity_of
 from skills.library.policies.relearning import compute_again, decoded
 from skills.library.policies.training import GATE_VERSION, certified, lessons
 from skills.library.recordings.demos import mark_demo
+from skills.schemas.policy_document import policy_identity
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases

@@ -154,7 +154,7 @@ def test_a_deleted_recording_that_is_used_again_does_not_block_a_restore(
     back_up(database, tmp_path / "b.zip")
     sent, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
     with database.writing() as session:
-        delete_recording(session, sent.sha256, "test", anybodys=True)
+        delete_recording(session, sent.sha256, "test", as_admin=True)
     again = restored()  # it knows nothing of the deletion; the list does
     cases.add_surgeon(again)
     demo = cases.add_demo(again).sha256
@@ -174,7 +174,7 @@ def test_a_recording_deleted_after_the_backup_is_deleted_again(
     )
     back_up(database, tmp_path / "b.zip")
     with database.writing() as session:
-        delete_recording(session, gone, "test", anybodys=True)
+        delete_recording(session, gone, "test", as_admin=True)
     with restored().reading() as session:
         assert session.scalars(select(StoredRecording.sha256)).all() == [kept]
 

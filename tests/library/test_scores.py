@@ -1,6 +1,6 @@
 """Scores on a real database: the reference, the percentiles, the history, and only surgeons with consent."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -10,18 +10,17 @@ from skills.db.models import Demonstration, MeasuredShape, StoredCalibration, St
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.parsed import parse_recording
-from skills.library.comparison.calibrations import keep
+from skills.library.comparison.calibrations import VERSION, digest_of, put_calibration
 from skills.library.comparison.scores import LEAST_DEMOS, progress, score
 from skills.library.people.surgeons import put_surgeon
 from skills.library.recordings.demos import mark_demo, upload_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
-from skills.packing import canonical, sha256
+from skills.schemas.calibrations import Calibration
 from skills.schemas.demos import DemoIn
 from skills.schemas.people import SurgeonIn
 from skills.schemas.scores import Score, ScoreIn
 from skills.scoring.calibration import SkillModel, as_numbers
 from tests.library import cases, rated
-from tests.library.test_calibrations import OLD
 from tests.scoring.test_rating import JUDGED as RATED
 from tests.scoring.test_rating import model
 
@@ -245,17 +244,27 @@ def test_what_cannot_be_scored_is_refused(database: Database) -> None:
         scored(database, reference, reference=bent(2.0, "kestrel", database).sha256)
 
 
-def calibration(*tasks: str, **judged: Any) -> dict[str, Any]:
-    """Return a stored calibration of tasks, each with the same figures and the same model."""
+def calibration(*tasks: str, **judged: Any) -> Calibration:
+    """Return a calibration of tasks, each with the same figures and the same model."""
     one = model(highest=[[1e9] * 17], lowest=[[-1e9] * 17])
     arrays = {
         name: np.repeat(value, len(tasks), axis=0) for name, value in vars(one).items() if isinstance(value, np.ndarray)
     }
-    return {
-        "version": 1,
-        "model": as_numbers(SkillModel(**vars(one) | arrays | {"tasks": tasks})),
-        "validated": {"tasks": dict.fromkeys(tasks, JUDGED | judged), "mean": JUDGED},
+    whole = JUDGED | {
+        "repetition_out": JUDGED["model"],
+        "rivals": {name: {"rho_interval": [0.0, 1.0], **rival} for name, rival in JUDGED["rivals"].items()},
+        "chance": {"permutations": 39, **JUDGED["chance"]},
     }
+    return Calibration.model_validate(
+        {
+            "version": VERSION,
+            "model": as_numbers(SkillModel(**vars(one) | arrays | {"tasks": tasks})),
+            "data": {"tasks": {}, "left_out": 0, "surgeons": 8, "trials": 40, "files": []},
+            "validated": {"tasks": dict.fromkeys(tasks, whole | judged), "mean": whole, "chosen": {}},
+            "settings": {"strengths": [], "seed": 0, "permutations": 39, "bootstraps": 0},
+            "versions": {},
+        }
+    )
 
 
 @pytest.fixture
@@ -267,9 +276,9 @@ def trial(database: Database) -> dict[str, Any]:
     return {"recording": sha256, "arm": "PSM_right", "start_s": 1.0, "end_s": 4.0}
 
 
-def stored(database: Database, about: dict[str, Any]) -> str:
+def stored(database: Database, about: Calibration) -> str:
     with database.writing() as session:
-        return keep(session, about, "test")[0].sha256
+        return put_calibration(session, about, "test")[0].sha256
 
 
 def test_the_whole_recording_is_rated_and_not_the_motion(database: Database, trial: dict[str, Any]) -> None:
@@ -291,7 +300,8 @@ def test_of_several_tasks_one_is_named(database: Database, trial: dict[str, Any]
 
 def test_a_task_without_evidence_is_not_rated(database: Database, trial: dict[str, Any]) -> None:
     about = calibration("Knot_Tying", "Needle_Passing")
-    about["validated"]["tasks"]["Needle_Passing"] = JUDGED | {"over_duration": [-0.1, 0.4]}
+    tasks = about.validated.tasks
+    tasks["Needle_Passing"] = replace(tasks["Needle_Passing"], over_duration=(-0.1, 0.4))
     stored(database, about)
     skill = scored(database, **trial, task="Needle_Passing").skill
     assert (skill.calibrated, skill.rating, skill.levels, skill.terms) == (False, None, None, ())
@@ -305,9 +315,10 @@ def test_a_recording_of_one_arm_is_not_rated_in_words(database: Database) -> Non
     assert skill.words[0].startswith("Not rated: A trial has two instruments")
 
 
-def test_a_calibration_of_an_older_version_is_not_used(database: Database, trial: dict[str, Any]) -> None:
+def test_a_calibration_of_another_version_is_not_used(database: Database, trial: dict[str, Any]) -> None:
     with database.writing() as session:
-        session.add(StoredCalibration(sha256=sha256(canonical(OLD)), about=OLD))
+        other = calibration("Knot_Tying").model_copy(update={"version": VERSION - 1})
+        session.add(StoredCalibration(sha256=digest_of(other), about=other))
     (said,) = scored(database, **trial).skill.words
     assert "another version" in said and "calibrate it again" in said
 

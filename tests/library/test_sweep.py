@@ -23,6 +23,7 @@ from skills.db.models import (
 from skills.db.service_tables import ErasedSurgeon, Event, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Busy, NotFound
+from skills.formats.parsed import parse_recording
 from skills.library.operation import sweep
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.jobs import find_job, identity_of, list_jobs
@@ -151,7 +152,7 @@ def test_a_content_half_cached_is_not_used_and_is_completed(
 def test_a_deleted_recording_is_gone_at_once_and_swept_later(database: Database, small: None):
     stored, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
     with database.writing() as session:
-        delete_recording(session, stored.sha256, "test", anybodys=True)
+        delete_recording(session, stored.sha256, "test", as_admin=True)
     with database.reading() as session, pytest.raises(NotFound):
         find_recording(session, stored.sha256)
     assert count(database, RecordingChunk) > 0
@@ -344,7 +345,7 @@ def test_a_small_upload_needs_one_transaction(database: Database, monkeypatch: p
 def test_bytes_sent_twice_at_once_are_kept_once(database: Database, small: None):
     data = cases.hand_off()
     first, second = cases.upload(data), cases.upload(data)
-    told = recordings.parse_upload(first)
+    told = recordings.read_upload(first, parse_recording)
     ahead = [recordings.send_ahead(database, one) for one in (first, second)]
     assert None not in ahead and len(set(ahead)) == 2
     kept = []

@@ -13,12 +13,12 @@ from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
 from skills import library
-from skills.comparison.distances import VERSION, Measured
+from skills.comparison.distances import Measured
 from skills.db.history import History
 from skills.db.models import Demonstration, ErasedInterval, MeasuredShape, RecordingSurgeon, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database
-from skills.library.comparison import measured
+from skills.library.comparison import measuring
 from skills.library.operation import backup, locks
 from skills.library.people import erasure
 from skills.library.policies import training
@@ -199,7 +199,9 @@ def keep_without_looking(database: Database, measured: Mapping[int, Measured]) -
     with database.writing([locks.DISTANCES]) as session:
         rows = session.scalars(select(Demonstration.row).where(Demonstration.row.in_(measured))).all()
         session.execute(delete(MeasuredShape).where(MeasuredShape.demonstration_row.in_(rows)))
-        kept = [{"demonstration_row": row, "version": VERSION, "measured": pack(measured[row])} for row in rows]
+        kept = [
+            {"demonstration_row": row, "version": measuring.VERSION, "measured": pack(measured[row])} for row in rows
+        ]
         if kept:
             session.execute(insert(MeasuredShape), kept)
 
@@ -224,7 +226,7 @@ PUT_BACK: dict[str, tuple[object, str, Callable[..., object], str]] = {
         "a_release_is_withdrawn_after_the_backup",
     ),
     "a_distance_from_an_erased_demonstration_is_stored": (
-        measured,
+        measuring,
         "store_shapes",
         keep_without_looking,
         "a_demonstration_is_erased_while_the_atlas_measures",

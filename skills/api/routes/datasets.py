@@ -7,10 +7,11 @@ from fastapi import Request, Response
 from skills.api.authorisation import needs
 from skills.api.dependencies import Actor, Db, Digest, Jobs, room_for_a_job
 from skills.api.openapi import ends, gives, gives_file, router_of, starts_job
-from skills.api.responses import Condition, Giving, accepted, as_asked, names
+from skills.api.responses import Condition, Giving, accepted
 from skills.api.routes.policies import Accept
-from skills.api.streams import Stream, stored_pieces
+from skills.api.streams import stored_file
 from skills.api.strict_json import Strict
+from skills.db.service_tables import StoredDataset
 from skills.formats import BYTES
 from skills.library.operation.jobs import QUEUED, did_nothing
 from skills.library.recordings import datasets
@@ -18,9 +19,6 @@ from skills.schemas.datasets import DatasetEpisodes, DatasetIn
 from skills.settings import MEBIBYTE
 
 router = router_of(route_class=Strict, tags=["datasets"], max_body_size=MEBIBYTE)
-
-
-ZIP = "application/zip"
 
 
 @router.post("/datasets", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404, 409, 410))
@@ -38,7 +36,9 @@ def export_dataset(body: DatasetIn, db: Db, jobs: Jobs, actor: Actor) -> Respons
     return answer
 
 
-@router.get("/datasets/{dataset}", dependencies=[needs("reader")], **gives_file((BYTES, ZIP), 404, 409))
+@router.get(
+    "/datasets/{dataset}", dependencies=[needs("reader")], **gives_file((BYTES, StoredDataset.media_type), 404, 409)
+)
 def get_dataset(
     dataset: Digest, db: Db, request: Request, if_none_match: Condition = None, accept: Accept = "*/*"
 ) -> Response:
@@ -46,21 +46,15 @@ def get_dataset(
 
     409 if a consent in it does not cover an export any more; consents are checked again for each chunk.
     """
-    with db.reading() as session:
-        kept = datasets.served_dataset(session, dataset)
-        sha256, tag = kept.sha256, {"ETag": f'"{kept.sha256}"'}
-        attached = {"Content-Disposition": f'attachment; filename="dataset-{sha256[:12]}.zip"'}
-        headers = {"Content-Length": str(kept.size_bytes), **attached, **tag}
-    if if_none_match is not None and names(if_none_match, tag["ETag"]):
-        return Response(status_code=304, headers=tag)
-
-    def refuse() -> None:
-        with db.reading() as session:
-            datasets.served_dataset(session, sha256)
-
-    read = partial(datasets.dataset_chunk, db, sha256)
-    # outside the session, because a slow client may keep the stream open for long
-    return Stream(stored_pieces(read, refuse, sha256, request.app.state.downloads), as_asked(accept, ZIP), headers)
+    return stored_file(
+        request,
+        db,
+        partial(datasets.served_dataset, dataset_sha256=dataset),
+        partial(datasets.dataset_chunk, db, dataset),
+        accept=accept,
+        if_none_match=if_none_match,
+        attachment="dataset-{}.zip",
+    )
 
 
 @router.get("/datasets/{dataset}/episodes", dependencies=[needs("reader")], **gives(DatasetEpisodes, 404))

@@ -10,10 +10,10 @@ from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, Parse, RowCu
 from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
-from skills.api.responses import Condition, Giving, as_asked, names, refuse_changed, stored
+from skills.api.responses import Condition, Giving, refuse_changed, stored
 from skills.api.routes.policies import Accept
 from skills.api.routes.recordings import RAW_BODY
-from skills.api.streams import Stream, stored_pieces
+from skills.api.streams import stored_file
 from skills.api.strict_json import Strict
 from skills.api.uploads import Incoming
 from skills.formats import BYTES, MEDIA_TYPES
@@ -87,29 +87,14 @@ def get_demo(demo: Digest, db: Db, give: Giving) -> Response:
         return give(Demonstration.model_validate(demos.find_demo(session, demo)))
 
 
-@router.get(
-    "/demos/{demo}/recording",
-    dependencies=[needs("reader")],
-    **gives_file((BYTES, *MEDIA_TYPES), 404, 409),
-)
+@router.get("/demos/{demo}/recording", dependencies=[needs("reader")], **gives_file((BYTES, *MEDIA_TYPES), 404, 409))
 def get_demo_recording(
     demo: Digest, db: Db, request: Request, if_none_match: Condition = None, accept: Accept = "*/*"
 ) -> Response:
     """Return the bytes of a demonstration's recording as uploaded; all are verified before the first is sent."""
-    with db.reading() as session:
-        kept = demos.exported_recording(session, demo)
-        media_type, sha256, tag = as_asked(accept, kept.media_type), kept.sha256, {"ETag": f'"{kept.sha256}"'}
-        headers = {"Content-Length": str(kept.size_bytes), **tag}
-    if if_none_match is not None and names(if_none_match, tag["ETag"]):
-        return Response(status_code=304, headers=tag)
-
-    def refuse() -> None:
-        with db.reading() as session:
-            demos.exported_recording(session, demo)
-
     read = partial(demos.exported_chunk, db, demo)
-    # outside the session, because a slow client may keep the stream open for long
-    return Stream(stored_pieces(read, refuse, sha256, request.app.state.downloads), media_type, headers)
+    find = partial(demos.exported_recording, demo_sha256=demo)
+    return stored_file(request, db, find, read, accept=accept, if_none_match=if_none_match)
 
 
 @router.get("/demos/{demo}/path", dependencies=[needs("reader")], **gives(DemoPath, 404, 409))

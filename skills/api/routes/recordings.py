@@ -87,13 +87,13 @@ def get_recording(recording: Digest, db: Db, give: Giving) -> Response:
 @router.delete("/recordings/{recording}", dependencies=[needs("uploader")], **ends(404, 409))
 def delete_recording(recording: Digest, db: Db, caller: Asking) -> None:
     """Delete a recording without demonstrations permanently; allowed to its uploader and to admins."""
-    anybodys = caller.role == "admin"
+    as_admin = caller.role == "admin"
     with db.reading() as session:
-        stored, alone = erasure.deletable_recording(session, recording, caller.name, anybodys=anybodys)
+        stored, alone = erasure.deletable_recording(session, recording, caller.name, as_admin=as_admin)
     recording = stored.sha256  # in full: the argument may be a prefix
     drop_contents(db, [stored.row] if alone else [])
     with db.writing([locks.recording(recording)]) as session:
-        erasure.delete_recording(session, recording, caller.name, anybodys=anybodys)
+        erasure.delete_recording(session, recording, caller.name, as_admin=as_admin)
     sweep_erased(db)
     db.forget()
 

@@ -12,7 +12,7 @@ from skills.api.dependencies import Configured
 from skills.api.gate import COOKIE, refuse_without_token
 from skills.api.pages import render
 from skills.errors import BadInput, NotSignedIn
-from skills.library.people.keys import sign_in, sign_out
+from skills.library.people.sign_ins import sign_in, sign_out
 from skills.settings import Settings
 
 FORM_BYTES, FIELDS = 4096, 4

@@ -34,13 +34,11 @@ from skills.comparison.distances import (
 from skills.db.models import Demonstration, SutureType
 from skills.db.session import Database
 from skills.errors import BadPath, Conflict, NotFound
-from skills.library.comparison.measured import far_apart
-from skills.library.comparison.members import Member, members_of, sessions_of, without_overlaps
+from skills.library.comparison.measuring import far_apart
+from skills.library.comparison.members import Member, comparable_demo, members_of, sessions_of, without_overlaps
 from skills.library.comparison.recognition import recognise_arms, recognise_demo, recognitions, votes
-from skills.library.people.consent import require
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import shares_served
-from skills.library.recordings.demos import find_demo
 from skills.schemas import comparison as described
 
 MOST = 2000  # demonstrations shown: a minute of measuring on two cores, once, and a response of 16 MB
@@ -154,12 +152,9 @@ def atlases(session: Session) -> list[tuple[SutureType, int, int]]:
 
 def _asked(session: Session, demo: str, suture: str) -> str:
     """Return the digest of the demonstration to be recognised; refuse one that is not in this atlas."""
-    found = find_demo(session, demo)
+    found = comparable_demo(session, demo)
     if found.suture != suture:
         raise NotFound(f"This demonstration is of '{found.suture}'; request that atlas.")
-    if found.withdrawn_at is not None:
-        raise Conflict("This demonstration was withdrawn, so it is not in the atlas.")
-    require(found.surgeon, "atlas")
     return found.sha256
 
 

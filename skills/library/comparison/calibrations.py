@@ -1,6 +1,6 @@
 """Models of skill: fitted to a laboratory's folder of rated trials, and stored as plain numbers.
 
-    folder in the layout of JIGSAWS --read_cohort--> Rated --calibrate_on--> about --keep--> StoredCalibration
+    folder in the layout of JIGSAWS --read_cohort--> Rated --calibrate_on--> Calibration --put_calibration--> row
 
 A model is stored with its provenance: the digests of all files, the settings, the versions of the code, and its
 accuracy on surgeons that were left out of the fit. The trials themselves and their names are not stored. It rates only
@@ -10,10 +10,9 @@ the tasks for which the evidence suffices (`accepted`).
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from sqlalchemy import select
@@ -27,6 +26,7 @@ from skills.formats import jigsaws
 from skills.formats.jigsaws import Trial
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy, did_you_mean
+from skills.schemas.calibrations import Calibration, CalibrationSettings, RatedTrials, TaskCounts
 from skills.scoring.calibration import (
     LEAST_RATING,
     LEVELS,
@@ -40,7 +40,7 @@ from skills.scoring.calibration import (
 )
 from skills.scoring.features import TRIAL_NAMES as FIGURES
 from skills.scoring.features import TrialFigures, measure_trial
-from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, parse_task, refusals, validate
+from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, refusals, validate
 
 NAMED = 5  # the most trials that an error names
 LIBRARIES = ("scipy", "numpy")  # the libraries that compute the numbers
@@ -52,11 +52,11 @@ class Rated:
     """A cohort, its source, and the names of trials that were left out, by the reason."""
 
     cohort: Cohort
-    data: dict[str, Any]
+    data: RatedTrials
     left_out: dict[str, list[str]]
 
 
-def read_cohort(folder: Path, *, tasks: Sequence[str] = (), told: Callable[[float], None] = NOTHING) -> Rated:
+def read_cohort(folder: Path, *, tasks: Sequence[str] = (), progress: Callable[[float], None] = NOTHING) -> Rated:
     """Read the rated trials of a folder in the layout of JIGSAWS.
 
     A letter is the same surgeon in all tasks.
@@ -64,7 +64,7 @@ def read_cohort(folder: Path, *, tasks: Sequence[str] = (), told: Callable[[floa
     Args:
         folder: The data set, or the folder of one task.
         tasks: Such as "Suturing"; without any, all of the folder.
-        told: Progress callback, called with the share that is done, 0 to 1.
+        progress: Callback, called with the share that is done, 0 to 1.
 
     Raises:
         BadInput: There is no such trial, none that is rated, or none that can be measured; a rating cannot be read; or
@@ -78,30 +78,30 @@ def read_cohort(folder: Path, *, tasks: Sequence[str] = (), told: Callable[[floa
     measured: dict[str, TrialFigures | None] = {}
     for number, trial in enumerate(rated):
         measured[trial.name] = _measured(trial)
-        told((number + 1) / len(rated))
-    kept = [trial for trial in rated if measured[trial.name] is not None]
-    if not kept:
+        progress((number + 1) / len(rated))
+    used = [trial for trial in rated if measured[trial.name] is not None]
+    if not used:
         raise BadInput(f"None of {len(rated)} trials can be measured: a trial has both instruments and some seconds.")
-    found = [figures for trial in kept if (figures := measured[trial.name]) is not None]
-    users, names = sorted({trial.user for trial in kept}), sorted({trial.task for trial in kept})
-    of_each = [ratings[trial.name] for trial in kept]
+    found = [figures for trial in used if (figures := measured[trial.name]) is not None]
+    users, names = sorted({trial.user for trial in used}), sorted({trial.task for trial in used})
+    of_each = [ratings[trial.name] for trial in used]
     cohort = Cohort(
         names=tuple(names),
         values=np.stack([one.values for one in found]),
         thirds=np.stack([one.thirds for one in found]),
-        tasks=np.array([names.index(trial.task) for trial in kept]),
-        surgeons=np.array([users.index(trial.user) for trial in kept]),
-        repetitions=np.array([trial.number for trial in kept]),
+        tasks=np.array([names.index(trial.task) for trial in used]),
+        surgeons=np.array([users.index(trial.user) for trial in used]),
+        repetitions=np.array([trial.number for trial in used]),
         ratings=np.array([(one.score, *one.parts) for one in of_each], np.float64),
         levels=np.array([LEVELS.index(one.skill) for one in of_each]),
     )
-    data = {
-        "tasks": {name: _counts([trial for trial in kept if trial.task == name], ratings) for name in names},
-        "left_out": len(trials) - len(kept),
-        "surgeons": len(users),
-        "trials": len(kept),
-        "files": sorted(map(_digest, _files(trials))),
-    }
+    data = RatedTrials(
+        tasks={name: _counts([trial for trial in used if trial.task == name], ratings) for name in names},
+        left_out=len(trials) - len(used),
+        surgeons=len(users),
+        trials=len(used),
+        files=sorted(map(_digest, _files(trials))),
+    )
     left_out = {
         "rated, but without a kinematics file": _without_file(trials),
         "unrated": [trial.name for trial in trials if trial.name not in ratings],
@@ -112,41 +112,42 @@ def read_cohort(folder: Path, *, tasks: Sequence[str] = (), told: Callable[[floa
 
 
 def calibrate_on(
-    rated: Rated, *, seed: int = 0, permutations: int = PERMUTATIONS, told: Callable[[float], None] = NOTHING
-) -> dict[str, Any]:
-    """Fit a model, validate it on surgeons left out, and return both with their provenance as JSON."""
-    found, judged = validate(rated.cohort, seed=seed, permutations=permutations, progress=told)
-    settings = {"strengths": list(STRENGTHS), "seed": seed, "permutations": permutations, "bootstraps": BOOTSTRAPS}
-    return {
-        "version": VERSION,
-        "model": as_numbers(calibrate(rated.cohort, found)),
-        "data": rated.data,
-        "validated": asdict(judged),
-        "settings": settings,
-        "versions": {"suture-skills": __version__} | {name: version(name) for name in LIBRARIES},
-    }
+    rated: Rated, *, seed: int = 0, permutations: int = PERMUTATIONS, progress: Callable[[float], None] = NOTHING
+) -> Calibration:
+    """Fit a model, validate it on surgeons left out, and return both with their provenance."""
+    found, judged = validate(rated.cohort, seed=seed, permutations=permutations, progress=progress)
+    return Calibration(
+        version=VERSION,
+        model=as_numbers(calibrate(rated.cohort, found)),
+        data=rated.data,
+        validated=judged,
+        settings=CalibrationSettings(
+            strengths=list(STRENGTHS), seed=seed, permutations=permutations, bootstraps=BOOTSTRAPS
+        ),
+        versions={"suture-skills": __version__} | {name: version(name) for name in LIBRARIES},
+    )
 
 
-def accepted(about: dict[str, Any]) -> list[str]:
+def accepted(about: Calibration) -> list[str]:
     """Return the tasks that a calibration rates."""
-    return [name for name, judged in about["validated"]["tasks"].items() if not refusals(parse_task(judged))]
+    return [name for name, judged in about.validated.tasks.items() if not refusals(judged)]
 
 
-def keep(session: Session, about: dict[str, Any], actor: str) -> tuple[StoredCalibration, bool]:
+def put_calibration(session: Session, about: Calibration, actor: str) -> tuple[StoredCalibration, bool]:
     """Store a calibration, which becomes the current one; return the row, and whether it is new.
 
     Raises:
         BadInput: On no task is the model better than chance and than the duration alone; nothing is stored.
     """
     if not accepted(about):
-        of_tasks = about["validated"]["tasks"]
-        why = " ".join(f"{name}: {' '.join(refusals(parse_task(judged)))}" for name, judged in of_tasks.items())
+        judged = about.validated
+        why = " ".join(f"{name}: {' '.join(refusals(one))}" for name, one in judged.tasks.items())
         raise BadInput(
             f"The model is not accepted, and nothing was stored. {why} These figures are for surgeons left out of the "
             "fit. Calibrate on rated trials of more surgeons, in one set-up.",
-            rho=about["validated"]["mean"]["model"]["rho"],
+            rho=judged.mean.model.rho,
         )
-    digest = sha256(canonical(about))
+    digest = digest_of(about)
     current = newest(session)
     if current is not None and current.sha256 == digest:
         return current, False
@@ -155,6 +156,11 @@ def keep(session: Session, about: dict[str, Any], actor: str) -> tuple[StoredCal
     session.flush()
     record_event(session, actor, "add", "calibration", digest)
     return stored, True
+
+
+def digest_of(about: Calibration) -> str:
+    """Return the digest of a calibration."""
+    return sha256(canonical(about.model_dump(mode="json")))
 
 
 def newest(session: Session) -> StoredCalibration | None:
@@ -168,12 +174,12 @@ def read_calibration(stored: StoredCalibration) -> SkillModel | None:
     Raises:
         Corrupt: It does not match its digest, or its numbers are no model.
     """
-    if sha256(canonical(stored.about)) != stored.sha256:
+    if digest_of(stored.about) != stored.sha256:
         raise Corrupt("The stored calibration is damaged.", Remedy(Action.CALIBRATE))
-    if stored.about["version"] != VERSION:
+    if stored.about.version != VERSION:
         return None
     try:
-        model = from_numbers(stored.about["model"])
+        model = from_numbers(stored.about.model)
         return model if model.figures == FIGURES else None
     except (BadInput, KeyError, TypeError) as error:
         raise Corrupt("The numbers of the stored calibration are no model.", Remedy(Action.CALIBRATE)) from error
@@ -235,14 +241,12 @@ def _ratings_of_task(trials: Sequence[Trial]) -> dict[str, jigsaws.RatedTrial]:
     return rated
 
 
-def _counts(kept: Sequence[Trial], ratings: dict[str, jigsaws.RatedTrial]) -> dict[str, Any]:
+def _counts(used: Sequence[Trial], ratings: dict[str, jigsaws.RatedTrial]) -> TaskCounts:
     """Return the numbers of trials, surgeons and levels of a task."""
-    levels = Counter(ratings[trial.name].skill for trial in kept)
-    return {
-        "trials": len(kept),
-        "surgeons": len({trial.user for trial in kept}),
-        "levels": dict(sorted(levels.items())),
-    }
+    levels = Counter(ratings[trial.name].skill for trial in used)
+    return TaskCounts(
+        trials=len(used), surgeons=len({trial.user for trial in used}), levels=dict(sorted(levels.items()))
+    )
 
 
 def _without_file(trials: Sequence[Trial]) -> list[str]:

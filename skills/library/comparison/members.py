@@ -13,7 +13,9 @@ from sqlalchemy.orm import Session
 
 from skills.arrays import Ints
 from skills.db.models import Demonstration, Surgeon
-from skills.library.people.consent import may
+from skills.errors import Conflict
+from skills.library.people.consent import may, require
+from skills.library.recordings.demos import find_demo
 
 OVERLAP = 0.5  # of the shorter cut; hand-offs that follow each other share a moment at most
 
@@ -38,6 +40,20 @@ class Member:
             return False
         shared_s = min(self.end_s, other.end_s) - max(self.start_s, other.start_s)
         return shared_s >= OVERLAP * min(self.end_s - self.start_s, other.end_s - other.start_s)
+
+
+def comparable_demo(session: Session, demo_sha256: str) -> Demonstration:
+    """Return a demonstration that may be compared.
+
+    Raises:
+        NotFound: There is no such demonstration.
+        Conflict: It was withdrawn, or its surgeon's consent does not cover a comparison.
+    """
+    found = find_demo(session, demo_sha256)
+    if found.withdrawn_at is not None:
+        raise Conflict("This demonstration was withdrawn; it is no longer compared.")
+    require(found.surgeon, "atlas")
+    return found
 
 
 def members_of(session: Session, suture: str) -> tuple[list[Member], int]:

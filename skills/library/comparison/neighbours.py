@@ -31,10 +31,9 @@ from skills.db.row_visibility import ALL_ROWS, ONLY
 from skills.db.session import Database
 from skills.errors import BadPath, Busy, Conflict
 from skills.library.comparison.atlas import DISTANCE, NO_DIRECTION, UNITS
-from skills.library.comparison.measured import shapes_of, store_shapes, stored_shapes
-from skills.library.comparison.members import Member, members_among, without_overlaps
-from skills.library.people.consent import may, require
-from skills.library.recordings.demos import find_demo
+from skills.library.comparison.measuring import shapes_of, store_shapes, stored_shapes
+from skills.library.comparison.members import Member, comparable_demo, members_among, without_overlaps
+from skills.library.people.consent import may
 from skills.schemas.comparison import Nearest, Neighbour
 
 ROWS_AT_ONCE = 500  # shapes read from the database
@@ -82,7 +81,7 @@ def nearest_to(database: Database, demo: str, count: int, *, scaled: bool = Fals
         raise Busy("The shapes of the demonstrations are being read; request it again in a moment.")
     try:
         with database.reading() as session:
-            asked = _asked(session, demo)
+            asked = comparable_demo(session, demo)
             unrestricted = _listed(session, asked.suture, unrestricted=True)
             visible = _listed(session, asked.suture) if ONLY in session.info else unrestricted
             held = _touch(database, asked.suture)
@@ -130,14 +129,6 @@ def forget_gone(database: Database) -> None:
                 _remove(session, held, _listed(session, suture, unrestricted=True))
     finally:
         _using.release()
-
-
-def _asked(session: Session, demo: str) -> Demonstration:
-    found = find_demo(session, demo)
-    if found.withdrawn_at is not None:
-        raise Conflict("This demonstration was withdrawn; it is no longer compared.")
-    require(found.surgeon, "atlas")
-    return found
 
 
 @dataclass(frozen=True)
@@ -234,7 +225,7 @@ def _add(database: Database, held: _SutureIndex, rows: list[int]) -> None:
 def _counted(database: Database, asked: Demonstration, rows: Ints, totals: Floats) -> list[Neighbour]:
     """Return the neighbours that are visible, active and agreed now, and not another cut of the same motion."""
     with database.reading() as session:
-        require(_asked(session, asked.sha256).surgeon, "atlas")  # consent may have ended since
+        comparable_demo(session, asked.sha256)  # consent may have ended since
         beside = members_among(session, asked.suture, rows.tolist())
     counted, _ = without_overlaps(beside)
     own = next((one for one in beside if one.row == asked.row), None)

@@ -13,7 +13,7 @@ erasure. It is meant for self-directed learning; it is not an examination.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from sqlalchemy import select
@@ -24,11 +24,11 @@ from skills.comparison.distances import distances, shape_of
 from skills.db.models import Demonstration, MeasuredShape, StoredRecording, Surgeon
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
-from skills.errors import BadInput, BadPath, Conflict, NotFound
+from skills.errors import BadInput, Conflict, NotFound
 from skills.learning.evaluation import TIE_BREAK
 from skills.library.comparison import calibrations
-from skills.library.comparison.measured import is_current
-from skills.library.comparison.members import member_of, sessions_of, without_overlaps
+from skills.library.comparison.measuring import is_current, shape_or_none
+from skills.library.comparison.members import comparable_demo, member_of, sessions_of, without_overlaps
 from skills.library.people.consent import may, require
 from skills.library.people.recorded import in_recording
 from skills.library.people.surgeons import find_surgeon
@@ -50,7 +50,7 @@ from skills.scoring.calibration import LEVELS, Level
 from skills.scoring.deviation import as_recorded, differences, laid, laid_on
 from skills.scoring.features import KINDS, Numbers, compare, measure, measure_trial
 from skills.scoring.rating import Skill, rate, unrated
-from skills.scoring.validation import parse_task, refusals
+from skills.scoring.validation import refusals
 
 LEAST_DEMOS, LEAST_SURGEONS = 5, 2  # of a level: with fewer, a percentile is meaningless, or describes one person
 MOST_OTHERS = 1000  # the newest of a suture type; more would not change a percentile visibly
@@ -64,15 +64,6 @@ class Other:
     row: Demonstration
     numbers: Numbers
     distance_mm: float
-
-
-@dataclass
-class _Level:
-    """The demonstrations of the surgeons of one skill level."""
-
-    name: Level
-    numbers: list[Numbers] = field(default_factory=list)
-    surgeons: set[int] = field(default_factory=set)
 
 
 def others_of(
@@ -121,50 +112,37 @@ def others_of(
 def _shapes(session: Session, rows: Sequence[int]) -> dict[int, Floats]:
     """Return the shapes of demonstrations, by row: those stored for the atlas, and newly measured ones for the rest."""
     of_these = MeasuredShape.demonstration_row.in_(rows)
-    kept = session.scalars(select(MeasuredShape).where(of_these, is_current()))
-    shapes = {one.demonstration_row: one.measured.shape_mm for one in kept}
+    stored = session.scalars(select(MeasuredShape).where(of_these, is_current()))
+    shapes = {one.demonstration_row: one.measured.shape_mm for one in stored}
     recorded = select(Demonstration.row, Demonstration.demo).where(Demonstration.row.in_({*rows} - {*shapes}))
-    for row, demo in session.execute(recorded):
-        try:
-            shapes[row] = shape_of(demo)
-        except BadPath:  # it ends where it began, so it has no direction for a comparison
-            continue
+    shapes |= {row: shape_or_none(demo) for row, demo in session.execute(recorded)}
     return {row: shape for row, shape in shapes.items() if shape is not None}
 
 
 def percentiles(
     others: Sequence[Other], mine: Numbers, scored: Demonstration | None, reference: Demonstration
 ) -> list[Percentiles]:
-    """Return the percentiles of a motion's figures among the demonstrations of each skill level."""
-    return [_percentile(level, mine) for level in _by_level(others, scored, reference)]
-
-
-def _by_level(others: Sequence[Other], scored: Demonstration | None, reference: Demonstration) -> list[_Level]:
-    """Group demonstrations by the skill level of their surgeons.
+    """Return the percentiles of a motion's figures among the demonstrations of each skill level.
 
     The scored one and the reference are left out, and all that are marked recovery or failure: a level is represented
     by what is not known to have failed. The curve of a surgeon has them all.
     """
-    levels: dict[str | None, _Level] = {name: _Level(name) for name in LEVELS}
     out = {reference.row, *([scored.row] if scored else [])}
-    for other in others:
-        level = levels.get(other.row.surgeon.skill_level)
-        if level is not None and other.row.row not in out and not other.row.failed:
-            level.numbers.append(other.numbers)
-            level.surgeons.add(other.row.surgeon_row)
-    return list(levels.values())
+    counted = [one for one in others if one.row.row not in out and not one.row.failed]
+    return [
+        _percentile(level, [one for one in counted if one.row.surgeon.skill_level == level], mine) for level in LEVELS
+    ]
 
 
-def _percentile(level: _Level, mine: Numbers) -> Percentiles:
+def _percentile(level: Level, some: Sequence[Other], mine: Numbers) -> Percentiles:
     """Return the share of a level's demonstrations with a smaller value, for each figure; equal values count half."""
     reason, below = None, None
-    if len(level.numbers) < LEAST_DEMOS or len(level.surgeons) < LEAST_SURGEONS:
+    surgeons = {one.row.surgeon_row for one in some}
+    if len(some) < LEAST_DEMOS or len(surgeons) < LEAST_SURGEONS:
         reason = f"at least {LEAST_DEMOS} demonstrations of {LEAST_SURGEONS} surgeons are needed"
     else:
-        below = {name: _share_below(mine[name], [one[name] for one in level.numbers]) for name in mine}
-    return Percentiles(
-        level=level.name, demos=len(level.numbers), surgeons=len(level.surgeons), reason=reason, below=below
-    )
+        below = {name: _share_below(mine[name], [one.numbers[name] for one in some]) for name in mine}
+    return Percentiles(level=level, demos=len(some), surgeons=len(surgeons), reason=reason, below=below)
 
 
 def _share_below(value: float | None, among: Sequence[float | None]) -> float | None:
@@ -301,7 +279,7 @@ def score(database: Database, asked: ScoreIn, parse: Parser) -> Score:
     # No transaction is open during the computation.
     numbers, beside = measure(scored.demo), measure(taught)
     deviation = laid_on(scored.demo, taught)
-    expert = [one for one in expert if _has_direction(one)]
+    expert = [one for one in expert if shape_or_none(one) is not None]
     named = differences(scored.demo, expert, taught) if expert else None
     skill = _skill(database, scored.recording, asked.task, parse)
     with database.reading() as session:  # again: consent may have ended while the two were compared
@@ -384,24 +362,13 @@ def _of_expert(session: Session, reference: Demonstration, scored: Demonstration
     return [one.demo for one in (reference, *newest) if one.row in counted]
 
 
-def _has_direction(demo: Demo) -> bool:
-    try:
-        shape_of(demo)
-    except BadPath:
-        return False
-    return True
-
-
 def _stored(session: Session, asked: ScoreIn) -> _Scored | None:
     """Return the stored demonstration to be scored; None if a part of a recording is to be scored."""
     if asked.demo is None:
         return None
-    row = find_demo(session, asked.demo)
+    row = comparable_demo(session, asked.demo)
     if row.suture != asked.suture:
         raise BadInput("The demonstration is of another suture type than the style.")
-    if row.withdrawn_at is not None:
-        raise Conflict("This demonstration was withdrawn; it is no longer compared.")
-    require(row.surgeon, "atlas")
     return _Scored(row.demo, row.recording, row)
 
 
@@ -460,7 +427,7 @@ def _skill(database: Database, recording: StoredRecording, task: str | None, par
     if named not in model.tasks:
         why = "the calibration has several tasks" if named is None else f"the calibration has no task {named}"
         return unrated(f"Not rated: {why}. Name the recording's task; it has {', '.join(model.tasks)}.")
-    judged = parse_task(stored.about["validated"]["tasks"][named])
+    judged = stored.about.validated.tasks[named]
     if refused := refusals(judged):
         return unrated(
             f"Not rated: the calibration is not accepted for {named}. {' '.join(refused)} The operator of this "

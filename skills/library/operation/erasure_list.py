@@ -268,7 +268,7 @@ def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
     uncut = ~exists().where(Demonstration.recording_row == StoredRecording.row)
     deleted = _here(later, "recordings", session, select(StoredRecording.sha256).where(uncut))
     for recording in deleted:
-        delete_recording(session, recording, "restore", anybodys=True)
+        delete_recording(session, recording, "restore", as_admin=True)
     active = select(Demonstration.sha256).where(Demonstration.withdrawn_at.is_(None))
     withdrawn = _here(later, "withdrawn", session, active)
     for demo in withdrawn:

@@ -48,13 +48,14 @@ from skills.formats.reader_process import READER_VERSION
 from skills.gridworld.reward import sparse_reward
 from skills.library.comparison.calibrations import read_calibration
 from skills.library.operation.history import Verified, verify_history
-from skills.library.operation.integrity import covered, demo_identity, planned, policy_identity, posed
+from skills.library.operation.integrity import covered, demo_identity, planned, posed
 from skills.library.operation.jobs import identity_of
 from skills.library.policies.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
 from skills.library.policies.versions import path_of, poses_of_demonstrations
 from skills.library.recordings.content_cache import alike, cached_content, read_entry
 from skills.library.recordings.recordings import Parser, recording_bytes
 from skills.packing import canonical, sha256
+from skills.schemas.policy_document import policy_identity
 from skills.settings import Settings
 from skills.transparency.notes import Note
 

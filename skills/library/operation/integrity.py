@@ -29,6 +29,7 @@ from skills.learning.tube import CertifiedPoses, clear_tube
 from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.remedies import Remedy
+from skills.schemas.policy_document import policy_identity
 
 Row = TypeVar("Row", Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording, StoredDataset)
 
@@ -165,16 +166,6 @@ def what_identifies(recording_sha256: str, surgeon: str, suture: str, demo: Demo
         "grid": asdict(path.grid),
         "hysteresis": path.hysteresis,
     }
-
-
-def policy_identity(manifest: dict[str, Any], policy: Policy) -> str:
-    """Return a policy version's digest: over its manifest (all that the API says of it) and its numbers."""
-    return policy_identity_of(manifest, digest(policy))
-
-
-def policy_identity_of(manifest: dict[str, Any], numbers: str) -> str:
-    """Return a policy version's digest from its manifest and the digest of its numbers, see `policy_identity`."""
-    return sha256(canonical([manifest, numbers]))
 
 
 def poses_identity_of(policy_sha256: str, poses: str) -> str:

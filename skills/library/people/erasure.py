@@ -157,21 +157,21 @@ def _drop_exports(session: Session, which: ColumnElement[bool], surgeon: Surgeon
     return dropped
 
 
-def delete_recording(session: Session, recording_sha256: str, actor: str, *, anybodys: bool) -> None:
+def delete_recording(session: Session, recording_sha256: str, actor: str, *, as_admin: bool) -> None:
     """Delete a recording without demonstrations; if others uploaded it too, delete only the caller's upload.
 
     Args:
         session: The caller's transaction.
         recording_sha256: The SHA-256 of its bytes.
         actor: The owner of the key that deletes it.
-        anybodys: Delete the recording even if others have uploaded it, as an admin does.
+        as_admin: Delete the recording even if others have uploaded it.
 
     Raises:
         NotFound: There is none.
         NotAllowed: Only others have uploaded it.
         Conflict: Demonstrations were cut out of it.
     """
-    stored, alone = deletable_recording(session, recording_sha256, actor, anybodys=anybodys)
+    stored, alone = deletable_recording(session, recording_sha256, actor, as_admin=as_admin)
     if not alone:
         mine = (RecordingUpload.recording_row == stored.row, RecordingUpload.actor == actor)
         session.execute(delete(RecordingUpload).where(*mine), **UNSYNCHRONISED)
@@ -181,7 +181,7 @@ def delete_recording(session: Session, recording_sha256: str, actor: str, *, any
 
 
 def deletable_recording(
-    session: Session, recording_sha256: str, actor: str, *, anybodys: bool
+    session: Session, recording_sha256: str, actor: str, *, as_admin: bool
 ) -> tuple[StoredRecording, bool]:
     """Return the recording that `delete_recording` would delete, and whether it itself and not only an upload of it.
 
@@ -189,14 +189,14 @@ def deletable_recording(
     """
     stored = find_recording(session, recording_sha256)
     senders = set(session.scalars(select(RecordingUpload.actor).where(RecordingUpload.recording_row == stored.row)))
-    if not anybodys and actor not in senders:
+    if not as_admin and actor not in senders:
         raise NotAllowed("Another user uploaded this recording; that user or an admin can delete it.")
     resting = select(func.count()).select_from(Demonstration).where(Demonstration.recording_row == stored.row)
     # The count covers all surgeons: a restricted key must not delete bytes under demonstrations that it cannot see.
     if session.scalar(resting.execution_options(**ALL_ROWS)):
         why = "Demonstrations, active or withdrawn, depend on this recording."
         raise Conflict(why, Remedy(Action.ERASE_DEMOS))
-    return stored, anybodys or senders == {actor}
+    return stored, as_admin or senders == {actor}
 
 
 def _resting_on(which: ColumnElement[bool]) -> Select[int]:

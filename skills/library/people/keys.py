@@ -1,4 +1,4 @@
-"""API keys of people and programs, and the sign-ins to the page that stand for them.
+"""API keys of people and programs.
 
 A key is `skills_ID_SECRET`: the id is public and distinguishes keys, the secret is 256 random bits. A key is shown
 once; its SHA-256 is stored. A slow hash would protect passwords that people choose, which can be guessed; 2^256 cannot
@@ -6,10 +6,6 @@ be searched, and a fast hash allows a check at every request.
 
 Events and releases contain the owner's name. It belongs to the owner, not to the key: somebody who replaces a key keeps
 access to their uploads, and two keys may be valid at the same time.
-
-A sign-in to the page takes a key once; a cookie of 256 random bits then stands for it, of which the SHA-256 is stored,
-as for keys. A sign-in ends when it was not used for a while, when it reaches its maximum age, when it is signed out,
-and when its key is revoked or expires.
 """
 
 import hashlib
@@ -18,17 +14,17 @@ import re
 import secrets
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from functools import lru_cache
 
-from sqlalchemy import delete, exists, or_, select, update
+from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
 from skills.db import now
 from skills.db.history import HISTORY
 from skills.db.leaves import LEAVES
 from skills.db.row_visibility import Only
-from skills.db.service_tables import Key, KeySurgeon, SignIn, record_event
+from skills.db.service_tables import Key, KeySurgeon, record_event
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.operation.history import edited_rows
 from skills.library.people.surgeons import find_surgeon
@@ -161,7 +157,7 @@ def holders_of(session: Session, texts: Iterable[str]) -> dict[str, Holder]:
     for at in range(0, len(shapes), KEYS_AT_ONCE):
         some = shapes[at : at + KEYS_AT_ONCE]
         rows = session.scalars(select(Key).where(Key.id.in_({shape[1] for shape in some})))
-        keys = {key.id: key for key in _ours(session, [key for key in rows if key.revoked_at is None])}
+        keys = {key.id: key for key in written_by_service(session, [key for key in rows if key.revoked_at is None])}
         for shape in some:
             key = keys.get(shape[1])
             # Compared in constant time, so that timing does not reveal the digest.
@@ -170,7 +166,7 @@ def holders_of(session: Session, texts: Iterable[str]) -> dict[str, Holder]:
     return found
 
 
-def _ours(session: Session, keys: Sequence[Key]) -> list[Key]:
+def written_by_service(session: Session, keys: Sequence[Key]) -> list[Key]:
     """Return the keys that nobody else than the service has written; each edited one is logged."""
     seen = {f"{key.row}/{surgeon.row}": key for key in keys for surgeon in key.surgeons if key.restricted}
     history, connection = session.info[HISTORY], session.connection()
@@ -215,64 +211,3 @@ def digest_of(text: str) -> str:
 @lru_cache(256)  # the SQL rules of an `Only` are compiled once, not at every look-up
 def _only(owner: str, rows: frozenset[int]) -> Only:
     return Only(owner, rows)
-
-
-NOTED_S = 60  # the interval at which use is stored, not at each request: a read should not cause a write
-
-
-@dataclass(frozen=True)
-class Lasts:
-    """The lifetime of a sign-in: the longest time without use, and the maximum age."""
-
-    idle_s: float
-    most_s: float
-
-
-def sign_in(session: Session, key_id: str, lasts: Lasts) -> str:
-    """Create a sign-in with a valid key and return its cookie; expired sign-ins are deleted."""
-    at = now()
-    idle, old = at - timedelta(seconds=lasts.idle_s), at - timedelta(seconds=lasts.most_s)
-    session.execute(delete(SignIn).where(or_(SignIn.used_at < idle, SignIn.created_at < old)))
-    cookie = secrets.token_urlsafe(SECRET_BYTES)
-    key = session.scalars(select(Key).where(Key.id == key_id)).one()
-    session.add(SignIn(digest=digest_of(cookie), key_row=key.row, created_at=at, used_at=at))
-    record_event(session, key.owner, "sign-in", "key", key_id)
-    return cookie
-
-
-def signed_in(session: Session, cookies: Iterable[str], lasts: Lasts) -> dict[str, tuple[Holder, bool]]:
-    """Return the holders signed in with several cookies, and whether `note_use` is due.
-
-    Sign-ins that ended, and those that the service did not write, or whose key it did not, are left out.
-    """
-    holders: dict[str, tuple[Holder, bool]] = {}
-    by_digest = {digest_of(cookie): cookie for cookie in cookies}
-    digests, at = list(by_digest), now()
-    for first in range(0, len(digests), KEYS_AT_ONCE):
-        rows = session.scalars(select(SignIn).where(SignIn.digest.in_(digests[first : first + KEYS_AT_ONCE]))).all()
-        names = [found.digest for found in rows]
-        edited = edited_rows(session.connection(), session.info[HISTORY], SignIn.__tablename__, names)
-        keys = {key.row for key in _ours(session, list({found.key.row: found.key for found in rows}.values()))}
-        for found in rows:
-            if found.digest in edited or found.key_row not in keys:
-                continue
-            idle_s, age_s = (at - found.used_at).total_seconds(), (at - found.created_at).total_seconds()
-            # The key's own expiry is left to the caller, as in `holders_of`.
-            if found.key.revoked_at is None and idle_s < lasts.idle_s and age_s < lasts.most_s:
-                holders[by_digest[found.digest]] = held(found.key), idle_s > NOTED_S
-    return holders
-
-
-def note_use(session: Session, cookie: str) -> None:
-    """Store the time of a sign-in's last use."""
-    session.execute(update(SignIn).where(SignIn.digest == digest_of(cookie)).values(used_at=now()))
-
-
-def sign_out(session: Session, cookie: str) -> None:
-    """End a sign-in."""
-    session.execute(delete(SignIn).where(SignIn.digest == digest_of(cookie)))
-
-
-def csrf_of(cookie: str) -> str:
-    """Return the token that a page's requests carry in addition to the cookie: no other site can read or compute it."""
-    return hmac.new(cookie.encode(), b"suture-skills csrf", hashlib.sha256).hexdigest()

@@ -38,7 +38,7 @@ class SurgeonsRecorded(NamedTuple):
 
     @property
     def single(self) -> bool:
-        """Whether nobody else is recorded beside one surgeon."""
+        """True if exactly one surgeon is recorded."""
         return len(self.surgeons) == 1 and not self.erased
 
     def may(self, use: consent.Use) -> bool:
@@ -89,7 +89,7 @@ def recording_for(session: Session, recording_sha256: str, use: consent.Use) -> 
 
 
 def shown_recording(database: Database, recording_sha256: str, parse: Parser) -> ParsedContent:
-    """Return what is read of a stored recording, to be shown; everybody in it is asked after it was read.
+    """Return the content of a stored recording, to be shown; the consents of all in it are checked after it was read.
 
     It raises the errors of `recording_for`, and of `skills.library.recordings.recordings.stored_recording`.
     """

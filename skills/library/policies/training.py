@@ -32,7 +32,8 @@ from skills.db.models import (
 from skills.db.packed import Sealed, seal, unpack_as
 from skills.db.service_tables import Job, record_events
 from skills.db.session import Database
-from skills.deep import Tell, learn_policy, require_installed
+from skills.deep import Progress as Tell
+from skills.deep import learn_policy, require_installed
 from skills.demonstration.demonstration import Demo, partner_motion
 from skills.demonstration.partner import PartnerMotion
 from skills.demonstration.recording import Recording
@@ -67,7 +68,7 @@ from skills.learning.q_learning import PhaseQLearning
 from skills.learning.ties import rule_in
 from skills.learning.tube import certified_poses
 from skills.library.operation import jobs
-from skills.library.operation.integrity import policy_identity_of, poses_identity_of, scene_digest
+from skills.library.operation.integrity import poses_identity_of, scene_digest
 from skills.library.operation.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
 from skills.library.people.consent import refusal, require
 from skills.library.people.surgeons import find_surgeon
@@ -81,6 +82,7 @@ from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass
 from skills.remedies import Action, Remedy
 from skills.schemas.policies import JOINING_FORMAT, Coverage, GridCertificate, Joining
+from skills.schemas.policy_document import policy_identity_of
 from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 
@@ -436,7 +438,7 @@ def learn_style(lesson: Lesson, request: TrainingRequest, settings: Settings, te
         learner,
         request["seed"],
         ties=rule_in(demo.frame, request.get("depth_along")),
-        tell=tell,
+        progress=tell,
         timeout_s=settings.learning_timeout_s,
         memory_bytes=settings.learning_memory_bytes,
     )

@@ -29,7 +29,7 @@ from skills.fields import as_json
 from skills.gridworld.domain import FINISHED, OUTSIDE
 from skills.gridworld.grid import GridPath
 from skills.learning.evaluation import dtw
-from skills.learning.policy import Policy, rollout
+from skills.learning.policy import rollout
 from skills.learning.tube import CertifiedPoses, PoseStep, certified_poses, next_pose
 from skills.library.operation import integrity
 from skills.library.operation.integrity import covered, learnt, posed
@@ -43,9 +43,9 @@ from skills.library.recordings.demos import find_demo, newest_demos
 from skills.remedies import Action, Remedy
 from skills.schemas import policies as described
 from skills.schemas.policies import Rollout
+from skills.schemas.policy_document import actions_of, live_actions_of, table_name
 from skills.schemas.pose_styles import NextPose
 
-MAX_JSON_ACTIONS = 10**6  # ours: above it, JSON has the certified domain alone, in `live_actions`
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
 ROWS_AT_ONCE = 1000  # of a query that reads many manifests, some 3 kB each
 BEST = Corridor()  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
@@ -198,45 +198,6 @@ def policy_json(policy: PolicyVersion, release: Release | None) -> dict[str, Any
         table_name(policy.manifest, "actions"): actions,
         **({} if live is None else {table_name(policy.manifest, "live_actions"): live}),
     }
-
-
-def table_name(manifest: dict[str, Any], name: str) -> str:
-    """Return the name under which a policy's actions are served: another one in a format with a joining table.
-
-    A client that does not know the joining table then finds no actions, and cannot follow them by the wrong rule.
-
-    Args:
-        manifest: The policy's manifest.
-        name: The name in the first format.
-    """
-    return f"{name}_joining" if "joining" in manifest else name
-
-
-def actions_of(policy: Policy) -> list[list[int]] | None:
-    """Return the greedy actions as JSON, by phase and state; None if there are more than `MAX_JSON_ACTIONS`."""
-    if policy.domain.phases * policy.path.grid.n_states > MAX_JSON_ACTIONS:
-        return None
-    table: list[list[int]] = policy.table().tolist()
-    return table
-
-
-def live_actions_of(policy: Policy) -> list[dict[str, list[int]]] | None:
-    """Return the greedy actions of the certified domain as JSON (`schemas.policies.PhaseActions`), by phase.
-
-    There are at most `skills.learning.policy.MAX_BYTES` / `BYTES_A_ROW` actions, 7 million; a larger policy cannot be
-    learnt.
-
-    Returns:
-        None where `actions_of` returns the actions of all states.
-    """
-    domain = policy.domain
-    if domain.phases * policy.path.grid.n_states <= MAX_JSON_ACTIONS:
-        return None
-    of_phases = np.split(policy.greedy, domain.offset[1:-1])
-    return [
-        {"low": low, "size": size, "actions": actions.tolist()}
-        for low, size, actions in zip(domain.low.tolist(), domain.size.tolist(), of_phases, strict=True)
-    ]
 
 
 def arrays_of(version: PolicyVersion) -> bytes:

@@ -68,7 +68,7 @@ class Entry:
 
     @property
     def is_large(self) -> bool:
-        """Whether it takes more than one transaction to store it."""
+        """True if it takes more than one transaction to store it."""
         return len(self.data) > AT_ONCE_BYTES
 
     def chunks(self, start: int = 0, end: int | None = None) -> Iterator[tuple[int, bytes]]:

@@ -27,22 +27,8 @@ from sqlalchemy import ColumnElement, Select, Table, delete, exists, insert, or_
 from sqlalchemy.orm import Session
 
 from skills.db import in_parts
-from skills.db.models import (
-    CHUNK_BYTES,
-    SUCCESS,
-    Demonstration,
-    StoredRecording,
-    Surgeon,
-    SutureType,
-)
-from skills.db.service_tables import (
-    DatasetChunk,
-    DatasetDemonstration,
-    Job,
-    StoredDataset,
-    record_event,
-    record_events,
-)
+from skills.db.models import CHUNK_BYTES, SUCCESS, Demonstration, StoredRecording, Surgeon, SutureType
+from skills.db.service_tables import DatasetChunk, DatasetDemonstration, Job, StoredDataset, record_event, record_events
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Conflict, NotFound, TooLarge
@@ -335,12 +321,7 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
             session.execute(insert(DatasetChunk), {"dataset_row": dataset.row, "number": number, "data": data})
             number += 1
         record_events(session, actor, "export", EXPORT, [(made.sha256, surgeon) for surgeon in surgeons])
-        return {
-            "dataset": made.sha256,
-            "size_bytes": made.size_bytes,
-            "episodes": len(episodes),
-            "frames": made.frames,
-        }
+        return {"dataset": made.sha256, "size_bytes": made.size_bytes, "episodes": len(episodes), "frames": made.frames}
 
     weakref.finalize(store, until_stored.close)  # and not at its end: a cancelled export is never stored
     return store
@@ -405,11 +386,7 @@ def _part(recording: Recording, episode: _Episode) -> ExportedEpisode:
 
 
 def write_dataset(
-    file: IO[bytes],
-    episodes: Iterable[ExportedEpisode],
-    about: AboutDataset,
-    version: Version,
-    settings: Settings,
+    file: IO[bytes], episodes: Iterable[ExportedEpisode], about: AboutDataset, version: Version, settings: Settings
 ) -> _Written:
     """Write a dataset as a zip into an empty file.
 

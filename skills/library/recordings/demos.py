@@ -37,25 +37,14 @@ from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import withdraw_failed, withdraw_resting_on
 from skills.library.recordings.parts import choose_part
-from skills.library.recordings.recordings import (
-    Parser,
-    Upload,
-    find_recording,
-    parse_upload,
-    stored_recording,
-    storing,
-)
+from skills.library.recordings.recordings import Parser, Upload, find_recording, read_upload, stored_recording, storing
 from skills.library.recordings.reports import report_on
 from skills.remedies import Action, Remedy
 from skills.schemas import DemoOutcome, OutcomeAsked
 from skills.schemas.demos import ChosenSegment, DemoIn, DemoPath, DemoReport, RewardMap
 
 # The actions of the events that mark an outcome.
-MARKS: dict[DemoOutcome, str] = {
-    "success": "mark-success",
-    "recovery": "mark-recovery",
-    "failure": "mark-failure",
-}
+MARKS: dict[DemoOutcome, str] = {"success": "mark-success", "recovery": "mark-recovery", "failure": "mark-failure"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +93,10 @@ def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, par
         parse: The reader, possibly in another process.
 
     Raises:
-        SkillsError: As in `make_demo` and `skills.library.recordings.recordings.parse_upload`.
+        SkillsError: As in `make_demo` and `skills.library.recordings.recordings.read_upload`.
     """
     _check_style(database, cut)
-    parsed = parse_upload(upload, parse)
+    parsed = read_upload(upload, parse)
     made = make_demo(parsed, cut)
     with storing(database, upload, parsed, actor, [locks.surgeon(cut.surgeon)]) as (session, stored, _):
         return _store_demo(session, stored, made, cut, actor)
@@ -162,9 +151,7 @@ def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: Demo
     )
     session.add(demonstration)
     session.flush()
-    session.add(
-        StoredRewardMap(sha256=digest(made.reward), demonstration_row=demonstration.row, map=made.reward),
-    )
+    session.add(StoredRewardMap(sha256=digest(made.reward), demonstration_row=demonstration.row, map=made.reward))
     record_event(session, actor, "add", "demonstration", demo_sha256, surgeon)
     _mark(session, demonstration, cut.outcome, cut.outcome_reason, actor)
     return Added(demonstration, True, made.segment)

@@ -1,6 +1,6 @@
 """Recordings: raw files, read and checked before any transaction, and stored in chunks of 1 MiB.
 
-Upload --parse_upload--> ParsedContent --put_recording--> StoredRecording, chunks --stored_recording--> ParsedContent
+Upload --read_upload--> ParsedContent --put_recording--> StoredRecording, chunks --stored_recording--> ParsedContent
 """
 
 import base64
@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from functools import partial
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 from sqlalchemy import delete, select, text, update
 from sqlalchemy.orm import Session
@@ -32,20 +32,13 @@ from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
-from skills.formats import MEDIA_TYPES, media_type_of, read_recording
+from skills.formats import MEDIA_TYPES, media_type_of
 from skills.formats.parsed import ParsedContent, parse_recording
 from skills.formats.reader_process import ConfinedReader
 from skills.library.operation import locks
 from skills.library.operation.integrity import find_by_digest
 from skills.library.people.surgeons import find_surgeon
-from skills.library.recordings.content_cache import (
-    Entry,
-    cache_content,
-    cached_content,
-    entry_of,
-    is_cached,
-    put_entry,
-)
+from skills.library.recordings.content_cache import Entry, cache_content, cached_content, entry_of, is_cached, put_entry
 from skills.remedies import Action, Remedy
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import refuse_uncontained
@@ -55,6 +48,7 @@ from skills.settings import Settings
 
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
 Parser = Callable[..., ParsedContent]  # `parse_recording`, or a callable that runs it in another process
+Content = TypeVar("Content", Recording, ParsedContent)
 BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
 
 DUE_S = 3600.0  # ours: an upload under way stores its next piece within seconds
@@ -96,41 +90,30 @@ def check_digest(header: str | None, of_bytes: str) -> bool:
     raise BadInput("Content-Digest needs sha-256=:BASE64:, the SHA-256 of the body.")
 
 
-def read_upload(upload: Upload, read: Reader = read_recording) -> Recording:
-    """Read and check a recording.
+def read_upload(upload: Upload, read: Callable[..., Content]) -> Content:
+    """Read an upload and check what is known of it.
+
+    Args:
+        upload: The recording's bytes.
+        read: `read_recording`, `parse_recording`, or a callable that runs one of them in another process.
 
     Raises:
         BadRecording: It cannot be used, or it has no checksum that would reveal damage.
         UnknownFormat: Its content is not of the media type of the request.
     """
-    _check_type(upload)
-    recording = read(upload.file, **upload.reading.options)
-    _check_vouched(upload, recording)
-    return recording
-
-
-def parse_upload(upload: Upload, parse: Parser = parse_recording) -> ParsedContent:
-    """Read and check a recording, and derive the proposed hand-offs and its description; it raises as `read_upload`."""
-    _check_type(upload)
-    parsed = parse(upload.file, **upload.reading.options)
-    _check_vouched(upload, parsed.recording)
-    return parsed
-
-
-def _check_type(upload: Upload) -> None:
     right = media_type_of(upload.file)
     if right != upload.media_type:
         raise UnknownFormat(
             f"The content is {MEDIA_TYPES[right]}, which does not match Content-Type; send it as {right}."
         )
-
-
-def _check_vouched(upload: Upload, recording: Recording) -> None:
+    found = read(upload.file, **upload.reading.options)
+    recording = found.recording if isinstance(found, ParsedContent) else found
     if recording.format in BAGS and recording.integrity == "none" and not upload.vouched:
         raise UnreadableRecording(
-            f"The content is {MEDIA_TYPES[upload.media_type]} without checksums, so damage could not be detected; "
-            "send it with a Content-Digest header (sha-256=:BASE64:), or record it as MCAP with CRCs."
+            f"The content is {MEDIA_TYPES[right]} without checksums, so damage could not be detected; send it with a "
+            "Content-Digest header (sha-256=:BASE64:), or record it as MCAP with CRCs."
         )
+    return found
 
 
 def store_recording(
@@ -141,7 +124,7 @@ def store_recording(
         with database.reading() as session:  # fails early, before the long reading; looked up again when writing
             find_surgeon(session, surgeon)
     names = [] if surgeon is None else [locks.surgeon(surgeon)]
-    with storing(database, upload, parse_upload(upload, parse), actor, names) as (session, stored, new):
+    with storing(database, upload, read_upload(upload, parse), actor, names) as (session, stored, new):
         if surgeon is not None:
             session.merge(RecordingSurgeon(recording_row=stored.row, surgeon_row=find_surgeon(session, surgeon).row))
     return stored, new
@@ -180,7 +163,7 @@ def preview(upload: Upload, parse: Parser = parse_recording) -> described.Record
     Raises:
         BadRecording, UnknownFormat: As in `read_upload`.
     """
-    parsed = parse_upload(upload, partial(parse, untimed=True))
+    parsed = read_upload(upload, partial(parse, untimed=True))
     content = vars(parsed.about)
     timed = parsed.recording.is_timed or upload.reading.rate_hz is not None
     if not timed:

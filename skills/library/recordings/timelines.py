@@ -5,19 +5,13 @@ the recording (`skills.library.recordings.recordings`). What may be seen is what
 in another form: the path of a demonstration, the trajectory of a plan. A file of a recorded motion is an export.
 """
 
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import (
-    Demonstration,
-    Plan,
-    PolicyVersion,
-    StoredPlayback,
-    StoredRecording,
-)
+from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording
 from skills.db.session import Database
 from skills.errors import NotFound
 from skills.library.people.recorded import recording_for, shown_recording
@@ -91,6 +85,15 @@ class TimelineLink(NamedTuple):
     name: str
 
 
+Row = StoredRecording | Demonstration | PolicyVersion | Plan
+FIND: dict[Source, Callable[[Session, str], Row]] = {
+    "recordings": find_recording,
+    "demos": find_demo,
+    "policy-versions": versions.find_by_digest,
+    "plans": find_plan,
+}
+
+
 def motion_named(session: Session, name: str) -> TimelineLink:
     """Return the resource of a name such as `plans/DIGEST`.
 
@@ -98,9 +101,9 @@ def motion_named(session: Session, name: str) -> TimelineLink:
         NotFound: There is no such resource.
     """
     source, _, sha256 = name.partition("/")
-    for known in get_args(Source):
+    for known, find in FIND.items():
         if source == known:
-            return _found(session, known, sha256)[0]
+            return _link(find(session, sha256))
     raise NotFound("There is no such motion to play beside this one; choose one of the list.")
 
 
@@ -110,34 +113,18 @@ def chosen(session: Session, source: Source, sha256: str) -> tuple[TimelineLink,
     Raises:
         NotFound: There is no such resource.
     """
-    here, row = _found(session, source, sha256)
+    row = FIND[source](session, sha256)
+    others: list[Row] = []
     if isinstance(row, StoredRecording):
         cut = select(Demonstration).where(Demonstration.recording_row == row.row)
-        demos = session.scalars(cut.order_by(Demonstration.start_s).limit(MOST_CHOICES)).all()
-        return here, [_demo(one) for one in demos]
-    of = row.policy if isinstance(row, Plan) else row
-    others = [_demo(one) for one in _newest(session, Demonstration, of.suture, of.surgeon_row)]
-    versions = _newest(session, PolicyVersion, of.suture, of.surgeon_row)
-    others += [_path(one) for one in versions if one.poses is not None]
-    plans = select(Plan).join(PolicyVersion).where(PolicyVersion.suture == of.suture).order_by(Plan.row.desc())
-    others += [_plan(one) for one in session.scalars(plans.limit(MOST_CHOICES))]
-    return here, [one for one in others if one != here]
-
-
-def _found(
-    session: Session, source: Source, sha256: str
-) -> tuple[TimelineLink, StoredRecording | Demonstration | PolicyVersion | Plan]:
-    if source == "recordings":
-        recording = find_recording(session, sha256)
-        return TimelineLink(source, recording.sha256, f"Recording {recording.sha256[:12]}"), recording
-    if source == "demos":
-        demo = find_demo(session, sha256)
-        return _demo(demo), demo
-    if source == "policy-versions":
-        version = versions.find_by_digest(session, sha256)
-        return _path(version), version
-    plan = find_plan(session, sha256)
-    return _plan(plan), plan
+        others += session.scalars(cut.order_by(Demonstration.start_s).limit(MOST_CHOICES))
+    else:
+        of = row.policy if isinstance(row, Plan) else row
+        others += _newest(session, Demonstration, of.suture, of.surgeon_row)
+        others += [one for one in _newest(session, PolicyVersion, of.suture, of.surgeon_row) if one.poses is not None]
+        plans = select(Plan).join(PolicyVersion).where(PolicyVersion.suture == of.suture).order_by(Plan.row.desc())
+        others += session.scalars(plans.limit(MOST_CHOICES))
+    return _link(row), [_link(one) for one in others if one is not row]
 
 
 def _newest(
@@ -149,13 +136,12 @@ def _newest(
     return session.scalars(query.limit(MOST_CHOICES)).all()
 
 
-def _demo(row: Demonstration) -> TimelineLink:
-    return TimelineLink("demos", row.sha256, f"{row.surgeon.slug}, demonstration {row.sha256[:8]}")
-
-
-def _path(row: PolicyVersion) -> TimelineLink:
-    return TimelineLink("policy-versions", row.sha256, f"{row.surgeon.slug}, learnt path of version {row.version}")
-
-
-def _plan(row: Plan) -> TimelineLink:
+def _link(row: Row) -> TimelineLink:
+    if isinstance(row, StoredRecording):
+        return TimelineLink("recordings", row.sha256, f"Recording {row.sha256[:12]}")
+    if isinstance(row, Demonstration):
+        return TimelineLink("demos", row.sha256, f"{row.surgeon.slug}, demonstration {row.sha256[:8]}")
+    if isinstance(row, PolicyVersion):
+        name = f"{row.surgeon.slug}, learnt path of version {row.version}"
+        return TimelineLink("policy-versions", row.sha256, name)
     return TimelineLink("plans", row.sha256, f"{row.policy.surgeon.slug}, plan {row.sha256[:8]}")

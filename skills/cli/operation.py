@@ -1,17 +1,20 @@
-"""Commands on this installation: serve, worker, migrate, seed, backup, restore, erasures, verify, doctor, keys."""
+"""Commands on the installation itself: serve, worker, migrate, seed, backup, restore, erasures, verify, doctor."""
 
 import gc
-import json
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from datetime import timedelta
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skills.cli.shell import KEY, AsJson, err, files, out, print_json, read_key, refusing, service, show
+from skills.cli.commands import KEY, command, read_key
+from skills.cli.connecting import service
+from skills.cli.output import Answer, err, outcome, say, status_line, table, warn
 from skills.errors import NotReady, SkillsError
+
+if TYPE_CHECKING:
+    from skills.library.operation.erasure_list import Erasures
+    from skills.library.operation.inspection import Checked
 
 commands = typer.Typer()
 _ENDED = {
@@ -49,8 +52,7 @@ Lists = Annotated[
 ]
 
 
-@commands.command()
-@refusing
+@command(commands)
 def serve(
     host: Annotated[str | None, typer.Option(help="The address to listen on; SKILLS_HOST by default.")] = None,
     port: Annotated[
@@ -70,8 +72,7 @@ def serve(
     run(wanted, samples=samples)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def worker() -> None:
     """Run jobs in this process, in addition to the workers that a service started."""
     gc.disable()  # as in `serve`, until the worker runs
@@ -83,61 +84,54 @@ def worker() -> None:
     run_worker(settings())
 
 
-@commands.command()
-@refusing
-def migrate(as_json: AsJson = False) -> None:
+@command(commands)
+def migrate() -> Answer:
     """Migrate the database to this version; an empty one gets its tables and the catalogue."""
     from skills.serving import prepare
     from skills.settings import settings
 
     prepare(settings())
-    _say("The database is up to date.", as_json, up_to_date=True)
+    return outcome("The database is up to date.", up_to_date=True)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def seed(
     to: Annotated[
         Path | None,
         typer.Option("--files", help="Only write the recordings as files, into this folder.", file_okay=False),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Load the synthetic sample surgeons and their recordings."""
     from skills.samples import load_samples, write_samples
 
     if to is not None:
-        with files():
-            written = write_samples(to)
-        show([{"file": str(file), "surgeon": surgeon} for file, surgeon in written], as_json, ("file", "surgeon"))
-        return
+        written = write_samples(to)
+        return table([{"file": str(file), "surgeon": surgeon} for file, surgeon in written], ("file", "surgeon"))
+        return None
     with service() as client, err.status("loading"):
-        show(list(load_samples(client)), as_json, ("surgeon", "suture", "id", "report.path_states"))
+        return table(list(load_samples(client)), ("surgeon", "suture", "id", "report.path_states"))
 
 
-@commands.command()
-@refusing
-def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)], as_json: AsJson = False) -> None:
+@command(commands)
+def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)]) -> Answer:
     """Write everything that is stored into one file, while the service goes on working."""
     from skills.db.session import Database
     from skills.library.operation.backup import back_up
     from skills.settings import settings
 
-    with closing(Database(settings().database_url)) as database, _telling("backing up") as told, files():
-        manifest = back_up(database, to, told)
+    with closing(Database(settings().database_url)) as database, status_line("backing up") as update:
+        manifest = back_up(database, to, update)
     rows, size, taken = sum(table.rows for table in manifest.tables), to.stat().st_size, manifest.created_at
     sentence = f"{to}: {rows} rows, {size / 1e6:.1f} MB, the state of {taken}."
-    _say(sentence, as_json, file=to, size_bytes=size, rows=rows, created_at=taken)
+    return outcome(sentence, file=to, size_bytes=size, rows=rows, created_at=taken)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def restore(
     source: Annotated[Path, typer.Argument(help="A file that `skills backup` wrote.", dir_okay=False)],
     erasures: Lists = None,
     check: Annotated[bool, typer.Option("--check", help="Only check the backup; write nothing.")] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Fill an empty database from a backup, and repeat everything that was ended since the backup.
 
     That is, erasures, withdrawals, revoked keys and narrowed consents, from the lists of --erasures.
@@ -147,32 +141,22 @@ def restore(
     from skills.library.operation import backup as library
     from skills.settings import settings
 
-    with files():
-        if check:
-            manifest = library.check_backup(source)
-            rows, taken = sum(table.rows for table in manifest.tables), manifest.created_at
-            _say(f"{source} is whole: {rows} rows of {taken}.", as_json, whole=True, rows=rows, created_at=taken)
-            return
-        refuse_left_over(settings())
-        sources, listed = _listed_in(erasures)
-        with closing(Database(settings().database_url)) as database, _telling("restoring") as told:
-            done = library.restore(database, source, listed, told)
+    if check:
+        manifest = library.check_backup(source)
+        rows, taken = sum(table.rows for table in manifest.tables), manifest.created_at
+        return outcome(f"{source} is whole: {rows} rows of {taken}.", whole=True, rows=rows, created_at=taken)
+    refuse_left_over(settings())
+    sources, listed = _listed_in(erasures)
+    with closing(Database(settings().database_url)) as database, status_line("restoring") as update:
+        done = library.restore(database, source, listed, update)
     rows, taken = sum(table.rows for table in done.manifest.tables), done.manifest.created_at
     ended = {name: count for name, count in vars(done).items() if name != "manifest"}
-    _say(
-        f"Restored {rows} rows, the state of {taken}.{_again(sources, ended)}",
-        as_json,
-        rows=rows,
-        created_at=taken,
-        **ended,
-    )
-    if not sources:
-        err.print(_NO_LIST.format(since=taken), style="red")
+    sentence = f"Restored {rows} rows, the state of {taken}.{_again(sources, ended)}"
+    return _ended(sentence, sources, taken, rows=rows, created_at=taken, **ended)
 
 
-@commands.command("accept-rollback")
-@refusing
-def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
+@command(commands, "accept-rollback")
+def accept_rollback(erasures: Lists = None) -> Answer:
     """Go on with a database that was put back to an older copy of itself, and repeat what was ended since.
 
     A service refuses such a database until this command is given; the event is logged, and the kept heads of its
@@ -183,17 +167,22 @@ def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
     from skills.library.operation import backup as library
     from skills.settings import settings
 
-    with files():
-        sources, listed = _listed_in(erasures)
-        with closing(Database(settings().database_url)) as database, _telling("accepting"):
-            try:
-                database.compare_history()
-            except NotReady:  # otherwise there is nothing to accept, as the next call says
-                refuse_left_over(settings())
-            ended = library.accept_rollback(database, listed)
-    _say(f"The database is accepted as it is.{_again(sources, ended)}", as_json, **ended)
+    sources, listed = _listed_in(erasures)
+    with closing(Database(settings().database_url)) as database, status_line("accepting"):
+        try:
+            database.compare_history()
+        except NotReady:  # otherwise there is nothing to accept, as the next call says
+            refuse_left_over(settings())
+        ended = library.accept_rollback(database, listed)
+    sentence = f"The database is accepted as it is.{_again(sources, ended)}"
+    return _ended(sentence, sources, "it was copied", **ended)
+
+
+def _ended(sentence: str, sources: list[str], since: str, **facts: Any) -> Answer:
+    """Return the answer of a restored or accepted database, and warn if no list of erasures was applied."""
     if not sources:
-        err.print(_NO_LIST.format(since="it was copied"), style="red")
+        warn(_NO_LIST.format(since=since))
+    return outcome(sentence, **facts)
 
 
 def _listed_in(given: list[str] | None) -> tuple[list[str], "Erasures"]:
@@ -219,29 +208,26 @@ def _again(sources: list[str], ended: dict[str, int]) -> str:
     return sentence
 
 
-@commands.command()
-@refusing
+@command(commands)
 def erasures(
     to: Annotated[Path, typer.Argument(help="The list; it grows with each erasure. Keep it apart from the backups.")],
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`."""
     from skills.db.session import Database
     from skills.library.operation.erasure_list import keep_erasures
     from skills.settings import settings
 
-    with closing(Database(settings().database_url)) as database, files():
+    with closing(Database(settings().database_url)) as database:
         listed = keep_erasures(database, to)
     surgeons, demos = len(listed.surgeons), len(listed.demos)
     others = {kind: len(names) for kind, names in listed.ended.items() if kind != "demonstrations"}
     others["failed"] = sum(outcome != "success" for _, outcome in listed.outcomes.values())
     more = ", ".join(f"{count} {_LISTED[kind]}" for kind, count in others.items())
     sentence = f"{to}: {surgeons} surgeons and {demos} demonstrations erased, {more}."
-    _say(sentence, as_json, file=to, surgeons=surgeons, demos=demos, **others)
+    return outcome(sentence, file=to, surgeons=surgeons, demos=demos, **others)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def verify(
     bag: Annotated[
         Path | None, typer.Argument(help="A bag for replay; by default the whole installation is verified.")
@@ -268,8 +254,7 @@ def verify(
     limit: Annotated[
         int | None, typer.Option(help="Of --relearn: at most this number of policies, drawn at random.", min=1)
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Check every digest, reference and leaf of the history of this installation, or one replay bag.
 
     The exit code is 1 if anything is wrong.
@@ -278,8 +263,7 @@ def verify(
         from skills.formats.verify import verify_bag
 
         lines = list(verify_bag(bag, None if key is None else read_key(key)))
-        _say("\n".join(lines), as_json, whole=True, checked=lines)
-        return
+        return outcome("\n".join(lines), whole=True, checked=lines)
     from skills.db.session import Database
     from skills.library.operation.history import sign_some_history
     from skills.library.operation.inspection import inspect_installation
@@ -291,10 +275,9 @@ def verify(
     with (
         closing(Database(settings().database_url)) as database,
         confined_reader(settings()) as reader,
-        _telling("verifying") as told,
+        status_line("verifying") as update,
     ):
-        with files():
-            heads = None if head is None else read_notes(head.read_text())
+        heads = None if head is None else read_notes(head.read_text())
         sign_some_history(database)
         for part in inspect_installation(
             database,
@@ -305,26 +288,22 @@ def verify(
             limit=limit,
         ):
             found[part.what] = part
-            told(f"{part.what} {part.count or ''}{'' if part.of is None else f' of {part.of}'}")
+            update(f"{part.what} {part.count or ''}{'' if part.of is None else f' of {part.of}'}")
     wrong = [one for part in found.values() for one in part.wrong]
     left_out = [one for part in found.values() for one in part.left_out]
-    if as_json:
-        counts = {
-            part.what: {"checked": part.count, "wrong": len(part.wrong), "left_out": len(part.left_out)}
-            for part in found.values()
-        }
-        lists = {"wrong": wrong, "left_out": left_out}
-        named = {name: [{"what": what, "why": why} for what, why in some] for name, some in lists.items()}
-        print_json({"checked": counts} | named)
-    else:
-        for part in found.values():
-            out.print(f"{part.what:23} {part.count:>10} {state_of(part)}")
-        for what, why in left_out:
-            out.print(f"{what}: {why}", markup=False, soft_wrap=True)
-        for what, why in wrong:
-            err.print(f"{what}: {why}", style="red", markup=False, soft_wrap=True)
-    if wrong:
-        raise typer.Exit(1)
+    counts = {
+        part.what: {"checked": part.count, "wrong": len(part.wrong), "left_out": len(part.left_out)}
+        for part in found.values()
+    }
+    lists = {"wrong": wrong, "left_out": left_out}
+    named = {name: [{"what": what, "why": why} for what, why in some] for name, some in lists.items()}
+
+    def show() -> None:
+        say(*(f"{part.what:23} {part.count:>10} {state_of(part)}" for part in found.values()))
+        say(*(f"{what}: {why}" for what, why in left_out))
+        warn(*(f"{what}: {why}" for what, why in wrong))
+
+    return Answer({"checked": counts} | named, show, exit_code=1 if wrong else 0)
 
 
 def state_of(part: "Checked") -> str:
@@ -336,24 +315,20 @@ def state_of(part: "Checked") -> str:
     return f"{part.count - len(part.left_out)} whole, {len(part.left_out)} not compared"
 
 
-@commands.command("public-key")
-@refusing
+@command(commands, "public-key")
 def public_key(
     to: Annotated[Path | None, typer.Argument(help="A file to write it to as well.", dir_okay=False)] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Print the public key of the service, which verifies bags, policies, cards and the history offline."""
     with service() as client:
         key = client.checkpoint().verifier
     if to is not None:
-        with files():
-            to.write_text(f"{key}\n")
-    _say(key, as_json, key=key)
+        to.write_text(f"{key}\n")
+    return outcome(key, key=key)
 
 
-@commands.command()
-@refusing
-def doctor(as_json: AsJson = False) -> None:
+@command(commands)
+def doctor() -> Answer:
     """Check what this installation needs to work, and which layers contain its readers; exit code 1 if a check fails.
 
     A layer of containment that is missing fails only with SKILLS_CONTAINMENT=required. With SKILLS_SERVER the service
@@ -379,9 +354,8 @@ def doctor(as_json: AsJson = False) -> None:
             break
         state, remark = ("ok", "") if name in held else (without, f"needs {needs}")
         checks.append({"check": f"containment: {name}", "state": state, "remark": remark})
-    show(checks, as_json, ("check", "state", "remark"))
-    if any(one["state"] == "failed" for one in checks):
-        raise typer.Exit(1)
+    failed = any(one["state"] == "failed" for one in checks)
+    return table(checks, ("check", "state", "remark"), exit_code=1 if failed else 0)
 
 
 def _there(name: str) -> tuple[list[dict[str, str]], tuple[str, ...] | None]:
@@ -400,99 +374,3 @@ def _without_password(source: str) -> str:
     from skills.db.engines import parse_url
 
     return parse_url(source).render_as_string(hide_password=True) if "://" in source else source
-
-
-def _say(sentence: str, as_json: bool, **facts: Any) -> None:
-    """Print the outcome: the sentence, or the facts as JSON."""
-    if as_json:
-        print_json(facts)
-    else:
-        out.print(sentence, markup=False, soft_wrap=True)
-
-
-@contextmanager
-def _telling(doing: str) -> Iterator[Callable[[str], None]]:
-    """Show a status line on stderr, and yield a callback that updates it."""
-    with err.status(doing) as status:
-        yield lambda what: status.update(f"{doing} {what}")
-
-
-if TYPE_CHECKING:
-    from skills.db.session import Database
-    from skills.library.operation.erasure_list import Erasures
-    from skills.library.operation.inspection import Checked
-
-key_commands = typer.Typer()
-keys = typer.Typer(no_args_is_help=True, help="Keys: callers and their roles.")
-key_commands.add_typer(keys, name="keys")
-
-Role = Literal["reader", "uploader", "trainer", "releaser", "admin"]  # as in `skills.settings`, which is slow to import
-COLUMNS = ("key", "owner", "role", "surgeons", "created_at", "expires_at", "state")
-
-
-@keys.command()
-@refusing
-def create(
-    owner: Annotated[str, typer.Argument(help="The owner's name, which events and releases record.")],
-    role: Annotated[Role, typer.Option(help="Each role includes the rights of those before it.")] = "reader",
-    days: Annotated[int | None, typer.Option(min=1, max=3650, help="Validity in days; unlimited by default.")] = None,
-    surgeon: Annotated[list[str] | None, typer.Option(help="Restrict it to this surgeon; repeatable.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Create a key, and print its secret, which is shown only this once."""
-    from skills.db import now
-    from skills.library.people.keys import about_key, create_key
-
-    with _database() as database, database.writing() as session:
-        expires_at = None if days is None else now() + timedelta(days=days)
-        key, text = create_key(session, owner, role, "local", expires_at=expires_at, surgeons=surgeon)
-        about = about_key(key).model_dump(mode="json")
-    if as_json:
-        out.print_json(json.dumps(about | {"secret": text}))
-        return
-    out.print(text, markup=False, soft_wrap=True)
-    err.print("It is not stored and cannot be shown again; keep it where only its owner can read it.")
-
-
-@keys.command("list")
-@refusing
-def list_all(as_json: AsJson = False) -> None:
-    """List all keys, including those that were revoked or have expired; secrets are not stored."""
-    from skills.library.people.keys import about_key, list_keys
-
-    with _database() as database, database.reading() as session:
-        found = [about_key(key).model_dump(mode="json") for key in list_keys(session)]
-    show(found if as_json else [_in_words(one) for one in found], as_json, COLUMNS)
-
-
-@keys.command()
-@refusing
-def revoke(
-    key: Annotated[str, typer.Argument(help="Its id: the eight characters after skills_.")], as_json: AsJson = False
-) -> None:
-    """Revoke a key: within a second every service of this installation refuses it."""
-    from skills.library.people.keys import about_key, revoke_key
-
-    with _database() as database, database.writing() as session:
-        about = about_key(revoke_key(session, key, "local")).model_dump(mode="json")
-    show(about if as_json else _in_words(about), as_json, COLUMNS)
-
-
-@contextmanager
-def _database() -> Iterator["Database"]:
-    """Open the database of this installation, migrated, and update the file of erasures afterwards."""
-    from skills.db.session import Database
-    from skills.settings import settings
-
-    with closing(Database(settings().database_url)) as database:
-        database.migrate()
-        yield database
-        if (file := settings().erasures_file) is not None:
-            from skills.library.operation.erasure_list import keep_up_erasures
-
-            keep_up_erasures(database, file)
-
-
-def _in_words(about: dict[str, Any]) -> dict[str, Any]:
-    surgeons = "all" if about["surgeons"] is None else ", ".join(about["surgeons"]) or "none any more"
-    return about | {"surgeons": surgeons}

@@ -98,14 +98,15 @@ def shapes_of(database: Database, rows: Sequence[int]) -> ByRow:
         some = Demonstration.row.in_(rows[at : at + DEMOS_AT_ONCE])
         with database.reading() as session:
             recorded = session.execute(select(Demonstration.row, Demonstration.demo).where(some)).all()
-        made |= {row: Measured(_shape(demo), *_NOTHING, signature_of(demo)) for row, demo in recorded}
+        made |= {row: Measured(shape_or_none(demo), *_NOTHING, signature_of(demo)) for row, demo in recorded}
     return made
 
 
-def _shape(demo: Demo) -> Floats | None:
+def shape_or_none(demo: Demo) -> Floats | None:
+    """Return the shape of a motion; None if it ends where it began, so that it has no direction to be compared."""
     try:
         return shape_of(demo)
-    except BadPath:  # it has no direction; the atlas lists it as left out
+    except BadPath:
         return None
 
 

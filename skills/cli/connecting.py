@@ -1,0 +1,63 @@
+"""The connection of a command to the service, or to the application in its own process, and waiting for jobs there."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING
+
+from skills.cli.output import job_status
+
+if TYPE_CHECKING:
+    from skills.client import Client
+    from skills.schemas.operation import Job
+    from skills.settings import Settings
+
+WAIT_S = 3600.0  # ours: a training takes seconds, with thousands of states at most an hour
+MANY = 64  # workers for a batch: as many as the settings say, which allow no more
+
+
+@contextmanager
+def service(*, workers: int = 0) -> Iterator["Client"]:
+    """Connect to the service, or to the application in this process with up to a number of workers (`connect`)."""
+    from skills.settings import settings
+
+    with connect(settings(), workers=workers) as client:
+        yield client
+
+
+@contextmanager
+def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
+    """Connect to the service at SKILLS_SERVER, or else to the application in this process.
+
+    In-process, jobs need a worker. While the connection is open as many run as the settings say, but not more than
+    `workers`: a further one does nothing for a single job, and takes processor time from the first.
+    """
+    from skills.client import Client
+
+    if settings.server:
+        shown = "" if settings.api_key is None else settings.api_key.get_secret_value()
+        with Client(settings.server, api_key=shown) as client:
+            yield client
+        return
+    from starlette.testclient import TestClient
+
+    from skills.api.app import create_app
+    from skills.library.operation.erasure_list import keep_up_erasures
+    from skills.serving import working
+
+    app = create_app(settings)
+    # no check of a key is needed: the caller has access to the database anyway
+    key = {"X-API-Key": app.state.access.own_key}
+    in_process = TestClient(app, base_url="http://localhost", headers=key)
+    crew = settings.model_copy(update={"workers": min(workers, settings.workers)})
+    with in_process as http, working(crew) if workers else nullcontext():
+        try:
+            yield Client(http)
+        finally:
+            if settings.erasures_file is not None:
+                keep_up_erasures(app.state.database, settings.erasures_file)
+
+
+def finished(client: "Client", job: "Job", timeout_s: float = WAIT_S) -> "Job":
+    """Wait for a job, with a status line on stderr."""
+    with job_status(job) as update:
+        return client.wait(job, timeout_s, progress=update)

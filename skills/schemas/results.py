@@ -1,0 +1,79 @@
+"""Results of jobs by kind, and the values of refusals, as a client reads them.
+
+`Job.result` is plain JSON, because its form depends on the kind of the job; each class here is that of one kind.
+"""
+
+from typing import Any, Self
+
+from skills.fields import Sha256
+from skills.schemas import Given
+from skills.schemas.operation import Job
+from skills.schemas.tries import TryStep
+
+
+class JobResult(Given):
+    """The base class of results."""
+
+    @classmethod
+    def of(cls, job: Job) -> Self:
+        """Return the result of a job of this kind that succeeded."""
+        assert job.result is not None, job
+        return cls.model_validate(job.result)
+
+
+class TrainingResult(JobResult):
+    """The version that a training made, whether it is released, and if not as requested, why and what to do."""
+
+    policy_version: int
+    sha256: Sha256
+    releasable: bool
+    released: bool
+    not_released_because: str | None = None
+    remedy: str | None = None
+
+
+class PlaybackResult(JobResult):
+    """The playback of a plan."""
+
+    playback: Sha256
+
+
+class DatasetResult(JobResult):
+    """An exported dataset."""
+
+    dataset: Sha256
+    size_bytes: int
+    episodes: int
+    frames: int
+
+
+class TryResult(JobResult):
+    """The steps of a try, also of one that runs or failed."""
+
+    steps: tuple[TryStep, ...] = ()
+
+    @classmethod
+    def of(cls, job: Job) -> Self:
+        """Return the steps of a try so far."""
+        return cls.model_validate(job.result or {})
+
+
+class NumberedSegment(Given):
+    """A proposed hand-off, and the number that names it as `segment`."""
+
+    segment: int
+    arm: str
+    start_s: float
+    end_s: float
+    reason: str
+
+
+class ProposedSegments(Given):
+    """The numbers of a refusal of kind "segment-not-named"."""
+
+    segments: tuple[NumberedSegment, ...]
+
+    @classmethod
+    def of(cls, numbers: dict[str, Any]) -> Self:
+        """Return the proposals that the numbers of a refusal list."""
+        return cls.model_validate(numbers)
