@@ -157,8 +157,8 @@ class History:
             is_older = head.origin == here.origin and here.size < head.size
             raise NotReady(
                 f"This database is {'older' if is_older else 'another'} than the one whose history was saved last: "
-                f"that one has {head.size} leaves, and this {here.size} without that head. Withdrawn releases and consents, "
-                "revoked keys and erased surgeons may be back in it.",
+                f"that one has {head.size} leaves, and this {here.size} without that head. Withdrawn releases and "
+                "consents, revoked keys and erased surgeons may be back in it.",
                 "Put the right copy of the database back.",
                 Remedy(Action.ACCEPT_ROLLBACK),
             )
