@@ -11,6 +11,7 @@ import secrets
 import tempfile
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 from sqlalchemy import URL, Connection, Engine, bindparam, insert, inspect, select, update
@@ -172,9 +173,9 @@ class History:
         if not connection.info.get(NOTING):
             return  # the job engine's database, or one that is not migrated yet
         effects, at = effects_of(take_notes(connection)), rfc3339(now())
-        for table, of_table in effects.items():
-            if table in logged():
-                self._write(connection, [*leaves_of_changes(connection, table, of_table, at)])
+        changed = [table for table in effects if table in logged()]
+        each = (leaves_of_changes(connection, table, effects[table], at) for table in changed)
+        self._write(connection, [*chain.from_iterable(each)])  # in one statement
 
     def _write(self, connection: Connection, leaves: Sequence[NewLeaf]) -> None:
         if not leaves:
