@@ -118,6 +118,12 @@ def test_each_outside_library_has_one_door(library, door):
     assert [file for file in importers(library) if not file.startswith(door)] == []
 
 
+def test_only_workers_import_the_makers_of_all_jobs():
+    """It imports the whole library: everything else names the use case that it calls."""
+    importing = [named(file) for file in FILES if "skills.library.perform" in imported(file)]
+    assert [file for file in importing if not file.startswith("jobs/")] == []
+
+
 def test_one_name_stands_for_one_thing():
     """A name that a layer shares with another by design is in `NOUNS` of tests/house.py, with the reason."""
     found = house.Measures()

@@ -132,9 +132,9 @@ class PolicyCache:
     def _seen(self, key: Style) -> Known | None:
         """Read the tables, all within one transaction; None where the release is under no signed checkpoint yet."""
         surgeon, suture, media_type = key
-        kept = self._database.history.saved_head()
+        saved = self._database.history.saved_head()
         with self._database.reading() as session:
-            self._database.history.compare(session.connection(), kept)
+            self._database.history.compare(session.connection(), saved)
             release = session.execute(STANDS, {"surgeon": surgeon, "suture": suture}).first()
             known = self._known.get(key)
             if known is not None and release is not None and known.release == tuple(release) and not known.over:
@@ -154,7 +154,7 @@ class PolicyCache:
             return Known(body, tuple(release), consent.last_day(served.policy.surgeon.consent), None)
 
     async def _sweep(self) -> None:
-        """Compare the database with its kept head, and remove erased policies from memory, periodically."""
+        """Compare the database with its saved head, and remove erased policies from memory, periodically."""
         while True:
             await asyncio.sleep(SWEEP_S)
             with suppress(SkillsError, SQLAlchemyError):  # the database may be readable again at the next sweep

@@ -159,7 +159,7 @@ def restore(
 def accept_rollback(erasures: Lists = None) -> Answer:
     """Go on with a database that was put back to an older copy of itself, and repeat what was ended since.
 
-    A service refuses such a database until this command is given; the event is logged, and the kept heads of its
+    A service refuses such a database until this command is given; the event is logged, and the saved heads of its
     history are set aside. Restore the right copy instead where there is one.
     """
     from skills.db.session import Database

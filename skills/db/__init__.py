@@ -22,7 +22,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import BigInteger, DateTime, Dialect, Index, Integer, MetaData, String, text
-from sqlalchemy.orm import DeclarativeBase, mapped_column
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 from sqlalchemy.sql.operators import OperatorType
 from sqlalchemy.types import JSON, TypeDecorator, TypeEngine
 
@@ -110,8 +110,19 @@ class Base(DeclarativeBase):
 
 
 RowId = Annotated[
-    int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)
+    int,
+    mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True, sort_order=-1),
 ]
+
+
+class Numbered(Base):
+    """The base class of tables whose rows are numbered; a number is never used again."""
+
+    __abstract__ = True
+
+    row: Mapped[RowId]
+
+
 Number = Annotated[int, mapped_column(BigInteger().with_variant(Integer, "sqlite"))]  # a row, without a foreign key
 Sha256 = String(64)
 Slug = String(64)

@@ -225,8 +225,8 @@ class Notified(Changes):
         except self._broken:
             self._drop(socket)
             return
-        while (told := line.notifies()) is not None:
-            if told.relname == self._own.encode():
+        while (notified := line.notifies()) is not None:
+            if notified.relname == self._own.encode():
                 self._known_s = self._beat_s
             else:
                 self._version = next(self._counter)

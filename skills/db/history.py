@@ -11,6 +11,7 @@ import secrets
 import tempfile
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 from sqlalchemy import URL, Connection, Engine, bindparam, insert, inspect, select, update
@@ -50,12 +51,12 @@ class History:
     """The history of one database, written with the signing key of this installation."""
 
     def __init__(self, engine: Engine, key_file: Path, heads_file: Path | None) -> None:
-        """Name the database, the file of the key, and that of the kept heads; they are read at the first use."""
+        """Name the database, the file of the key, and that of the saved heads; they are read at the first use."""
         self._engine = engine
         self.key_file = key_file
         self.heads_file = heads_file or heads_file_for(key_file, engine.url)
         self._why: tuple[str, *tuple[str | Remedy, ...]] | None = None  # nothing is served or written
-        self._agreed: tuple[str | None, Note | None] | None = None  # the newest checkpoint, and the kept head
+        self._agreed: tuple[str | None, Note | None] | None = None  # the newest checkpoint, and the saved head
         self._seal: Seal | None = None
         self._origin: str | None = None
 
@@ -89,7 +90,7 @@ class History:
         return NotReady(*self._why) if self._why else None
 
     def saved_head(self) -> Note | None:
-        """Return the head that was kept last; None if none was.
+        """Return the head that was saved last; None if none was.
 
         Raises:
             NotReady: It cannot be read.
@@ -101,7 +102,7 @@ class History:
             raise
 
     def saved_heads(self, origin: str) -> list[Note]:
-        """Return all kept heads of one log.
+        """Return all saved heads of one log.
 
         Raises:
             Corrupt: The file has anything else.
@@ -110,30 +111,30 @@ class History:
             return []
         return [note for note in read_notes(self.heads_file.read_text()) if note.checkpoint.origin == origin]
 
-    def compare(self, connection: Connection, kept: Note | None) -> None:
-        """Compare the database with the signing key and with the head that was kept last; the result is `refused`.
+    def compare(self, connection: Connection, saved: Note | None) -> None:
+        """Compare the database with the signing key and with the head that was saved last; the result is `refused`.
 
         Args:
             connection: In a transaction.
-            kept: The head, read before the transaction began, as it must not be newer than what that sees.
+            saved: The head, read before the transaction began, as it must not be newer than what that sees.
 
         Raises:
             NotReady: The database is not the one that was signed last: older, another one, or signed with another key.
         """
         newest = newest_checkpoint(connection)
-        if (newest, kept) == self._agreed:
+        if (newest, saved) == self._agreed:
             return
         try:
-            self._refuse_another(connection, newest, kept)
+            self._refuse_another(connection, newest, saved)
         except NotReady as refused:
             self._why, self._agreed = (refused.message, *refused.remedies), None
             raise
-        self._why, self._agreed = None, (newest, kept)
+        self._why, self._agreed = None, (newest, saved)
 
-    def _refuse_another(self, connection: Connection, newest: str | None, kept: Note | None) -> None:
+    def _refuse_another(self, connection: Connection, newest: str | None, saved: Note | None) -> None:
         """Refuse the database; the message names no path, for it is also given to callers without a key."""
         if newest is None:
-            if kept is not None:
+            if saved is not None:
                 raise NotReady(*REMOVED)
             return  # no history was begun
         try:
@@ -147,18 +148,18 @@ class History:
                 "Name the file of the right key in SKILLS_SIGNING_KEY. If it is lost, restore a backup into an empty "
                 "database, whose history then goes on with this key.",
             )
-        if kept is None or kept == note:
+        if saved is None or saved == note:
             return
-        head, here = kept.checkpoint, note.checkpoint
+        head, here = saved.checkpoint, note.checkpoint
         if head.origin != here.origin and here.size == 0:
             return  # a history that has just begun takes the place of another
-        known = select(CHECKPOINTS.c.row).where(CHECKPOINTS.c.size == head.size, CHECKPOINTS.c.note == kept.text)
+        known = select(CHECKPOINTS.c.row).where(CHECKPOINTS.c.size == head.size, CHECKPOINTS.c.note == saved.text)
         if connection.scalar(known) is None:
             is_older = head.origin == here.origin and here.size < head.size
             raise NotReady(
-                f"This database is {'older' if is_older else 'another'} than the one whose history was kept last: that "
-                f"one has {head.size} leaves, and this {here.size} without that head. Withdrawn releases and consents, "
-                "revoked keys and erased surgeons may be back in it.",
+                f"This database is {'older' if is_older else 'another'} than the one whose history was saved last: "
+                f"that one has {head.size} leaves, and this {here.size} without that head. Withdrawn releases and "
+                "consents, revoked keys and erased surgeons may be back in it.",
                 "Put the right copy of the database back.",
                 Remedy(Action.ACCEPT_ROLLBACK),
             )
@@ -172,9 +173,9 @@ class History:
         if not connection.info.get(NOTING):
             return  # the job engine's database, or one that is not migrated yet
         effects, at = effects_of(take_notes(connection)), rfc3339(now())
-        for table, of_table in effects.items():
-            if table in logged():
-                self._write(connection, [*leaves_of_changes(connection, table, of_table, at)])
+        changed = [table for table in effects if table in logged()]
+        each = (leaves_of_changes(connection, table, effects[table], at) for table in changed)
+        self._write(connection, [*chain.from_iterable(each)])  # in one statement
 
     def _write(self, connection: Connection, leaves: Sequence[NewLeaf]) -> None:
         if not leaves:

@@ -19,7 +19,7 @@ import orjson
 from sqlalchemy import JSON, BigInteger, Connection, Index, LargeBinary, String, Table, insert, select, update
 from sqlalchemy.orm import Mapped, mapped_column
 
-from skills.db import Base, RowId, now, partial_index
+from skills.db import Numbered, now, partial_index
 from skills.db.change_notes import ADD, CHANGE, REMOVE, Effect
 from skills.db.logged_rows import ADDED, CACHES, ROWS_AT_ONCE, commitment_to, compact, digests_of, logged
 from skills.transparency.merkle import leaf_hash
@@ -28,7 +28,7 @@ from skills.transparency.signing_keys import Seal
 SALT_BYTES = 32
 
 
-class Leaf(Base):
+class Leaf(Numbered):
     """A leaf of the history; `number` is its place in the tree, None until it is under a signed checkpoint.
 
     `digests` are of the row's columns, by their names; together with `salt` and `key` they are removed with the row.
@@ -36,7 +36,6 @@ class Leaf(Base):
 
     __tablename__ = "history"
 
-    row: Mapped[RowId]
     number: Mapped[int | None] = mapped_column(BigInteger, unique=True)
     table_name: Mapped[str] = mapped_column(String(64))
     key: Mapped[str | None] = mapped_column(String(300))
@@ -51,12 +50,11 @@ class Leaf(Base):
     )
 
 
-class StoredCheckpoint(Base):
+class StoredCheckpoint(Numbered):
     """A signed head of the history, and the hashes of the complete subtrees of its tree, from which it grows."""
 
     __tablename__ = "history_checkpoints"
 
-    row: Mapped[RowId]
     size: Mapped[int] = mapped_column(BigInteger, index=True)
     note: Mapped[str] = mapped_column(String(1000))
     subtrees: Mapped[bytes] = mapped_column(LargeBinary)

@@ -29,7 +29,7 @@ from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from skills.comparison.distances import Measured
-from skills.db import AsJson, Base, Number, RowId, Sha256, Slug, now, partial_index
+from skills.db import AsJson, Base, Number, Numbered, RowId, Sha256, Slug, now, partial_index
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import Pause
@@ -62,12 +62,11 @@ stored(Trajectory, OtherArm, Poses)
 store_as_palette(Coverage, "share")  # one for each waypoint
 
 
-class Surgeon(Base):
+class Surgeon(Numbered):
     """A surgeon, identified by a pseudonym; `subject` is the random name in events, which erasure deletes."""
 
     __tablename__ = "surgeons"
 
-    row: Mapped[RowId]
     slug: Mapped[str] = mapped_column(Slug, unique=True)
     subject: Mapped[str] = mapped_column(String(32), unique=True)
     skill_level: Mapped[str | None]
@@ -77,23 +76,21 @@ class Surgeon(Base):
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 
-class LastUsed(Base):
+class LastUsed(Numbered):
     """The last number of a style's versions that were erased, or lost with a restoration: no version has it again."""
 
     __tablename__ = "used_numbers"
 
-    row: Mapped[RowId]
     surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row", ondelete="CASCADE"), index=True)
     suture: Mapped[str] = mapped_column(Slug)  # not of the catalogue alone: a restored one may be older
     last: Mapped[int]
 
 
-class Erasure(Base):
+class Erasure(Numbered):
     """A record that a surgeon was erased, with a salted digest of the pseudonym instead of the pseudonym."""
 
     __tablename__ = "erasures"
 
-    row: Mapped[RowId]
     salt: Mapped[str] = mapped_column(String(64))
     digest: Mapped[str] = mapped_column(Sha256)
     erased_at: Mapped[datetime] = mapped_column(default=now)
@@ -111,12 +108,11 @@ class SutureType(Base):
     description: Mapped[str] = mapped_column(String(2000))
 
 
-class StoredRecording(Base):
+class StoredRecording(Numbered):
     """An uploaded file, identified by the SHA-256 of its bytes."""
 
     __tablename__ = "recordings"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     size_bytes: Mapped[int] = mapped_column(BigInteger)
     media_type: Mapped[str]
@@ -145,7 +141,7 @@ class RecordingSurgeon(Base):
     surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"), primary_key=True, index=True)
 
 
-class ErasedInterval(Base):
+class ErasedInterval(Numbered):
     """An interval of a recording in which somebody is seen whose demonstration was erased; without times all of it.
 
     The surgeon is null once that surgeon is erased: then nobody can allow a use of it any more.
@@ -153,7 +149,6 @@ class ErasedInterval(Base):
 
     __tablename__ = "erased_intervals"
 
-    row: Mapped[RowId]
     recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), index=True)
     surgeon_row: Mapped[int | None] = mapped_column(ForeignKey("surgeons.row"), index=True)
     start_s: Mapped[float | None]
@@ -211,7 +206,7 @@ class ParsedChunk(Base):
     data: Mapped[bytes] = mapped_column(LargeBinary)
 
 
-class ProposalMark(Base):
+class ProposalMark(Numbered):
     """A decision on a proposed hand-off of a recording, with a note: rejected, or open again. The newest one counts.
 
     `number` is that of the proposal in `StoredRecording.about`, counted from 1. An accepted proposal has no mark: its
@@ -220,7 +215,6 @@ class ProposalMark(Base):
 
     __tablename__ = "proposal_marks"
 
-    row: Mapped[RowId]
     recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"))
     number: Mapped[int]
     state: Mapped[str]
@@ -237,12 +231,11 @@ class ProposalMark(Base):
 SUCCESS = "success"
 
 
-class DemonstrationOutcome(Base):
+class DemonstrationOutcome(Numbered):
     """A mark of a demonstration: success, recovery or failure, with the reason. The newest mark counts."""
 
     __tablename__ = "demonstration_outcomes"
 
-    row: Mapped[RowId]
     demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"))
     outcome: Mapped[str]
     reason: Mapped[str | None]
@@ -339,23 +332,21 @@ class MeasuredShape(Base):
     measured: Mapped[Measured] = mapped_column(Packed(Measured))
 
 
-class StoredRewardMap(Base):
+class StoredRewardMap(Numbered):
     """The reward map that Algorithm 1 computed for a demonstration."""
 
     __tablename__ = "reward_maps"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256)
     demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), unique=True)
     map: Mapped[RewardMap] = mapped_column(Packed(RewardMap), deferred=True)
 
 
-class PolicyVersion(Base):
+class PolicyVersion(Numbered):
     """One learnt policy of a style; `manifest` is its description for clients, without the release."""
 
     __tablename__ = "policy_versions"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     training: Mapped[str] = mapped_column(Sha256, index=True)  # identity of the training that produced it
     surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
@@ -393,7 +384,7 @@ class PolicyVersion(Base):
         return [*withdrawn, *sorted(marked)]
 
 
-class StoredPoses(Base):
+class StoredPoses(Numbered):
     """The pose style of a policy version: the poses of its demonstrations' hands, and the certificate of their tube.
 
     A version whose demonstrations have no orientation has none.
@@ -401,7 +392,6 @@ class StoredPoses(Base):
 
     __tablename__ = "pose_styles"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256)
     policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), unique=True)
     poses: Mapped[CertifiedPoses] = mapped_column(Packed(CertifiedPoses), deferred=True)
@@ -419,12 +409,11 @@ class PolicyDemonstration(Base):
     demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), primary_key=True, index=True)
 
 
-class Release(Base):
+class Release(Numbered):
     """A release of a policy version; the newest release of a style that is not withdrawn is served."""
 
     __tablename__ = "releases"
 
-    row: Mapped[RowId]
     policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), index=True)
     surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
     suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
@@ -436,12 +425,11 @@ class Release(Base):
     __table_args__ = (Index("ix_releases_style", "surgeon_row", "suture", "row"),)
 
 
-class Plan(Base):
+class Plan(Numbered):
     """A plan: grid worlds stacked at suture points."""
 
     __tablename__ = "plans"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), index=True)
     about: Mapped[dict[str, Any]]
@@ -451,12 +439,11 @@ class Plan(Base):
     policy: Mapped[PolicyVersion] = relationship(lazy="joined", innerjoin=True)
 
 
-class StoredPlayback(Base):
+class StoredPlayback(Numbered):
     """The simulator's measurements of a plan, and the verdict."""
 
     __tablename__ = "playbacks"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     plan_row: Mapped[int] = mapped_column(ForeignKey("plans.row"), index=True)
     feasible: Mapped[bool]
@@ -467,18 +454,17 @@ class StoredPlayback(Base):
     plan: Mapped[Plan] = relationship(lazy="joined", innerjoin=True)
 
 
-class StoredPictures(Base):
+class StoredPictures(Numbered):
     """The pictures of a playback, drawn after its verdict."""
 
     __tablename__ = "playback_pictures"
 
-    row: Mapped[RowId]
     playback_row: Mapped[int] = mapped_column(ForeignKey("playbacks.row"), unique=True)
     drawn: Mapped[Pictures] = mapped_column(Packed(Pictures), deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now, index=True)
 
 
-class StoredCalibration(Base):
+class StoredCalibration(Numbered):
     """A calibrated model of skill as plain numbers, with its data set and its accuracy; the newest one is used.
 
     It is calibrated on rated trials of a laboratory, not on the surgeons here; it contains no trial and no pseudonym.
@@ -486,7 +472,6 @@ class StoredCalibration(Base):
 
     __tablename__ = "calibrations"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256)
     about: Mapped[Calibration] = mapped_column(AsJson(Calibration))
     created_at: Mapped[datetime] = mapped_column(default=now)

@@ -35,16 +35,16 @@ def heads_file_for(key_file: Path, url: URL) -> Path:
 
 
 def last_head(file: Path) -> Note | None:
-    """Return the head that was kept last; None if there is no file.
+    """Return the head that was saved last; None if there is no file.
 
     Raises:
         NotReady: The file cannot be read, or does not end in a signed checkpoint.
     """
     try:
-        with file.open("rb") as kept:
-            size = kept.seek(0, os.SEEK_END)
-            kept.seek(max(size - TAIL_BYTES, 0))
-            tail = kept.read().decode(errors="replace")
+        with file.open("rb") as saved:
+            size = saved.seek(0, os.SEEK_END)
+            saved.seek(max(size - TAIL_BYTES, 0))
+            tail = saved.read().decode(errors="replace")
         # a note has two paragraphs, and a blank line follows it
         return read_notes("\n\n".join(tail.split("\n\n")[-3:-1]) + "\n")[0] if size else None
     except (FileNotFoundError, NotADirectoryError):
@@ -52,7 +52,7 @@ def last_head(file: Path) -> Note | None:
     except (OSError, Corrupt) as error:
         why = error.strerror if isinstance(error, OSError) else "it does not end in a signed checkpoint"
         raise NotReady(
-            f"The kept heads of the history cannot be read ({why}), so an older copy of the database would not be "
+            f"The saved heads of the history cannot be read ({why}), so an older copy of the database would not be "
             "noticed.",
             "Put the file back as the service wrote it.",
             ANOTHER,
@@ -81,7 +81,7 @@ def save_head(file: Path, note: str) -> None:
 
 
 def archive_heads(file: Path) -> None:
-    """Rename a file of kept heads, so that the next head begins a new one; the old one stays as evidence.
+    """Rename a file of saved heads, so that the next head begins a new one; the old one stays as evidence.
 
     Raises:
         BadSettings: It cannot be renamed.
@@ -91,4 +91,4 @@ def archive_heads(file: Path) -> None:
     except FileNotFoundError:
         return
     except OSError as error:
-        raise BadSettings(f"The kept heads {file} cannot be set aside: {error.strerror}.", ANOTHER) from error
+        raise BadSettings(f"The saved heads {file} cannot be set aside: {error.strerror}.", ANOTHER) from error

@@ -22,7 +22,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
-from skills.db import Base, Number, RowId, Sha256, now, partial_index
+from skills.db import Base, Number, Numbered, Sha256, now, partial_index
 from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
 from skills.schemas.operation import JobState
@@ -31,7 +31,7 @@ from skills.settings import Role
 LONGEST_REASON = 2000  # characters
 
 
-class Job(Base):
+class Job(Numbered):
     """A request for work.
 
     `identity` is the digest of its resolved inputs: there is at most one active or succeeded job of an identity.
@@ -43,7 +43,6 @@ class Job(Base):
 
     __tablename__ = "jobs"
 
-    row: Mapped[RowId]
     id: Mapped[str] = mapped_column(String(32), unique=True)
     kind: Mapped[str] = mapped_column(String(20))
     identity: Mapped[str] = mapped_column(Sha256)
@@ -86,7 +85,7 @@ class ErasedSurgeon(Base):
     surgeon_row: Mapped[Number] = mapped_column(primary_key=True, autoincrement=False)
 
 
-class StyleToRetrain(Base):
+class StyleToRetrain(Numbered):
     """One style of a batch: its demonstration, its part of the batch, and its outcome.
 
     `tries` counts how often a worker has started it, `stale` holds the reasons why it needed training, and `comparison`
@@ -95,7 +94,6 @@ class StyleToRetrain(Base):
 
     __tablename__ = "retraining_styles"
 
-    row: Mapped[RowId]
     job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
     part_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
     demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), index=True)
@@ -134,13 +132,12 @@ class DatasetDemonstration(Base):
     __table_args__ = (CheckConstraint("split IN ('train', 'val', 'test', 'recovery', 'failure')", name="split"),)
 
 
-class StoredDataset(Base):
+class StoredDataset(Numbered):
     """An exported dataset, identified by the SHA-256 of its zip file."""
 
     __tablename__ = "datasets"
     media_type = "application/zip"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"), unique=True)
     size_bytes: Mapped[int] = mapped_column(BigInteger)
@@ -171,7 +168,7 @@ class Executor(Base):
     faults_found: Mapped[int | None]
 
 
-class Key(Base):
+class Key(Numbered):
     """An API key of a person or a program: the digest of its secret, which is not stored itself, and its permissions.
 
     `id` is the public part of the key. `restricted` limits a key to its surgeons even when all of them are erased.
@@ -179,7 +176,6 @@ class Key(Base):
 
     __tablename__ = "keys"
 
-    row: Mapped[RowId]
     id: Mapped[str] = mapped_column(String(16), unique=True)
     digest: Mapped[str] = mapped_column(Sha256)
     owner: Mapped[str] = mapped_column(String(64))
@@ -216,12 +212,11 @@ class SignIn(Base):
     key: Mapped[Key] = relationship(lazy="joined", innerjoin=True)
 
 
-class Event(Base):
+class Event(Numbered):
     """An audit event: actor, action, object and time; people appear only by their random subject."""
 
     __tablename__ = "events"
 
-    row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     at: Mapped[datetime] = mapped_column(default=now)
     actor: Mapped[str]

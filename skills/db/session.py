@@ -70,7 +70,7 @@ class Database:
             url: SQLAlchemy URL of a SQLite file or a PostgreSQL database.
             patience_ms: Timeout for locks and for connections, `BUSY_TIMEOUT_MS` by default.
             signing_key: The file of the key that its history is written with, by default of `SKILLS_SIGNING_KEY`.
-            checkpoints: The file of its kept heads, by default of `SKILLS_CHECKPOINTS`, or else beside the key.
+            checkpoints: The file of its saved heads, by default of `SKILLS_CHECKPOINTS`, or else beside the key.
 
         Raises:
             BadSettings: The URL is not one of these, or the folder of the file cannot be created.
@@ -125,14 +125,14 @@ class Database:
         return narrowed
 
     def compare_history(self) -> None:
-        """Compare the database with its signing key and its kept head; see `History.compare`.
+        """Compare the database with its signing key and its saved head; see `History.compare`.
 
         Raises:
             NotReady: It is not the database that was signed last.
         """
-        kept = self.history.saved_head()
+        saved = self.history.saved_head()
         with self.reading() as session:
-            self.history.compare(session.connection(), kept)
+            self.history.compare(session.connection(), saved)
 
     def on_condition(self, check: Callable[[Session], None], names: Sequence[str]) -> "Database":
         """Return this database with a check at the beginning of each writing transaction, which may refuse it.

@@ -27,7 +27,7 @@ from tests.library import cases
 from tests.put_back import copy_away, put_back
 from tests.waiting import until
 
-OLDER = "older than the one whose history was kept last"
+OLDER = "older than the one whose history was saved last"
 CLOSED = (("GET", POLICY), ("GET", "/readyz"), ("GET", "/surgeons"), ("GET", "/"), ("PUT", "/surgeons/heron"))
 
 
@@ -141,7 +141,7 @@ def test_a_history_that_went_another_way_is_not_served(url: str):
         sign_history(database)
     put_back(older, url)
     with serving(url) as service:
-        assert_closed(service, "another than the one whose history was kept last")
+        assert_closed(service, "another than the one whose history was saved last")
 
 
 def test_a_backup_that_is_restored_in_its_place_is_accepted(tmp_path: Path):
@@ -172,7 +172,7 @@ def test_a_database_begun_anew_is_served_and_the_one_of_before_is_not(tmp_path: 
         service.client.put_surgeon("kestrel")
     put_back(before, url)
     with serving(url) as service:
-        assert_closed(service, "another than the one whose history was kept last")
+        assert_closed(service, "another than the one whose history was saved last")
 
 
 def test_another_key_serves_and_writes_nothing(url: str, tmp_path: Path):

@@ -145,8 +145,8 @@ def _prove(database: Database) -> None:
         note = newest_checkpoint(session.connection()) or ""
         verifier = database.history.key.verifier(note.partition("\n")[0])
         said = served_at(session, database.history, "kestrel", cases.SUTURE, now())
-    values = [check_disclosed(proof, note, verifier) for proof in said["proofs"]]
-    assert values[1]["sha256"] == said["policy"]
+    values = [check_disclosed(proof.model_dump(), note, verifier) for proof in said.proofs]
+    assert values[1]["sha256"] == said.policy
 
 
 def _edits_past_the_service_are_found(database: Database) -> None:

@@ -600,8 +600,8 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
     asked = ("kestrel", cases.SUTURE, now())
     with database.reading() as session:
         given = served_at(session, database.history, *asked)
-    for proof in given["proofs"]:
-        check_disclosed(proof, given["checkpoint"]["note"], given["checkpoint"]["verifier"])
+    for proof in given.proofs:
+        check_disclosed(proof.model_dump(), given.checkpoint.note, given.checkpoint.verifier)
     for edit in (
         "UPDATE history_tiles SET root = {blob}, hashes = {blob}",
         "DELETE FROM history_tiles",

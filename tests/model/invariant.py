@@ -26,7 +26,7 @@ Nothing here depends on the service. `Model` is updated after each action of a u
 5.  **Keys.** A key is valid until it is revoked or has expired, and not after.
 6.  **Passed on.** A recording, as bytes, as a timeline or in a dataset, is passed on while every surgeon in it allows
     export: who was named at its upload, or has, or had, a demonstration there. Erasing one of them closes it for good.
-7.  **Rolled back.** If the database is put back to a state older than the kept head, nothing is served and nothing
+7.  **Rolled back.** If the database is put back to a state older than the saved head, nothing is served and nothing
     is written until the right one is back, or the rollback is accepted, which is a restore of the older one. Nor is
     anything served or written with another signing key.
 8.  **Elsewhere.** Another machine, with another processor, learns every version again as it is stored, and exports the

@@ -670,7 +670,7 @@ class Installation(Compared):
         put_back(copy, self.url)
         self._open()
         if not same:  # otherwise nothing was logged since, so it is no older one
-            self._serves_nothing("kept last")
+            self._serves_nothing("saved last")
             self._stop()
             if accepted:
                 with closing(Database(self.url)) as database:

@@ -103,30 +103,30 @@ def restore(
 
 
 def accept_rollback(database: Database, erasures: Erasures = NOTHING) -> dict[str, int]:
-    """Go on with a database that is not the one whose history was kept last, and apply a list of erasures.
+    """Go on with a database that is not the one whose history was saved last, and apply a list of erasures.
 
-    An event says so, with the size of the head that was given up; the file of kept heads is set aside.
+    An event says so, with the size of the head that was given up; the file of saved heads is set aside.
 
     Returns:
         The numbers of what the list ended again, by name as in `Restored`.
 
     Raises:
-        Conflict: It is the database that was kept last.
+        Conflict: It is the database that was saved last.
         NotReady: It was signed with another key.
-        BadSettings: The file of kept heads cannot be set aside.
+        BadSettings: The file of saved heads cannot be set aside.
     """
     history = database.history
-    kept = history.saved_head()
+    saved = history.saved_head()
     with database.writing() as session:
         connection = session.connection()
         with suppress(NotReady):
-            history.compare(connection, kept)
-            raise Conflict("The database is the one whose history was kept last: there is nothing to accept.")
+            history.compare(connection, saved)
+            raise Conflict("The database is the one whose history was saved last: there is nothing to accept.")
         history.compare(connection, None)
         archive_heads(history.heads_file)
         ended = _end_again(session, erasures)
         session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(submitted_at=None))
-        size = 0 if kept is None else kept.checkpoint.size
+        size = 0 if saved is None else saved.checkpoint.size
         record_event(session, "local", "accept", "rollback", f"{size} leaves")
     sign_history(database)
     sweep_erased(database)

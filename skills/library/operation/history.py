@@ -1,11 +1,11 @@
 """The history, signed and verified: every logged row against its newest leaf, every leaf against the signed tree.
 
-    leaves --sign_history--> checkpoints, in the database and in the file of its kept heads
+    leaves --sign_history--> checkpoints, in the database and in the file of its saved heads
     database, key, heads --verify_history--> findings, each named by table, key and column
 
 What verification finds depends on what the attacker lacks. With the database alone nobody can write a leaf that the
 signing key sealed, or a checkpoint that it signed. Somebody who puts back an older state of the whole database, with
-its older checkpoint, is found by a later head that was kept elsewhere.
+its older checkpoint, is found by a later head that was saved elsewhere.
 """
 
 import hmac

@@ -359,25 +359,28 @@ def _again(
 # ---- the input of each digest, and values that must agree --------------------------------------------------------
 
 
-def _recording(row: StoredRecording) -> Why:
+def _session_of(row: Any) -> Session:
     session = object_session(row)
     assert session is not None
+    return session
+
+
+def _recording(row: StoredRecording) -> Why:
+    session = _session_of(row)
     size = sum(len(piece) for piece in recording_bytes(session, row))  # raises `Corrupt` if the digest differs
     if size != row.size_bytes:
         yield f"it has {size} bytes, its row has {row.size_bytes}"
 
 
 def _parsed_recording(row: ParsedRecording) -> Why:
-    session = object_session(row)
-    assert session is not None
+    session = _session_of(row)
     if row.version == READER_VERSION:  # others are not used
         read_entry(session, session.get_one(StoredRecording, row.recording_row))  # raises `Corrupt`
     yield from ()
 
 
 def _dataset(row: StoredDataset) -> Why:
-    session = object_session(row)
-    assert session is not None
+    session = _session_of(row)
     seen, size = hashlib.sha256(), 0
     query = select(DatasetChunk.data).where(DatasetChunk.dataset_row == row.row).order_by(DatasetChunk.number)
     for data in session.scalars(query.execution_options(yield_per=1)):
@@ -400,8 +403,7 @@ def _demonstration(row: Demonstration) -> Why:
 
 
 def _reward_map(row: StoredRewardMap) -> Why:
-    session = object_session(row)
-    assert session is not None
+    session = _session_of(row)
     if digest(row.map) != row.sha256:
         yield "it does not match its digest"
     path = session.get_one(Demonstration, row.demonstration_row).path
