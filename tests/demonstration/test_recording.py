@@ -318,8 +318,8 @@ def test_a_file_says_what_its_joints_show_and_no_planted_mistake_is_silent(mista
         except NotMetres:  # positions a thousand times too large
             assert mistake is another_unit
             continue
-        (shown,) = about["identifications"]
-        verdict, stated = shown["found"]["verdict"], shown["found"]["stated"]
+        (shown,) = about.identifications
+        verdict, stated = shown.found.verdict, shown.found.stated
         assert (verdict in ("identified", "undetermined")) == (mistake is None), (seed, one.truth, stated, shown)
 
 

@@ -10,7 +10,7 @@ from skills.demonstration.recording import equal_samples, recorded_joints, recor
 from skills.errors import BackwardStamps, NotFinite, NotMetres, RepeatedStamps
 from skills.formats import read_recording
 from skills.formats.parsed import parse
-from skills.schemas.recordings import Recording
+from skills.schemas.recordings import Dropped, Recording
 
 STEP_NS = 10_000_000
 
@@ -140,13 +140,13 @@ def table(stamps_ns):
 
 def test_the_description_counts_dropped_and_equal_samples():
     sound = parse(table(even(91))).about
-    assert (sound["dropped"], sound["quality"][0]["equal_samples"]) == ([], 0)
+    assert (sound.dropped, sound.quality[0].equal_samples) == ([], 0)
     stamps = even(100)
     stamps[50] = stamps[49] - 1
     about = parse(table(stamps)).about
-    assert about["dropped"] == [{"topic": "table", "backward_stamps": 1}]
-    assert about["quality"][0]["equal_samples"] == 9
+    assert about.dropped == [Dropped("table", 1)]
+    assert about.quality[0].equal_samples == 9
     rest = {"id": "0" * 64, "sha256": "0" * 64, "size_bytes": 1, "media_type": "text/csv", "format": "csv"}
     rest |= {"integrity": "none", "created_at": "2026-01-01T00:00:00Z"}
-    assert Recording.model_validate(rest | sound).dropped == []
-    assert Recording.model_validate(rest | about).dropped[0].backward_stamps == 1
+    assert Recording.model_validate(rest | vars(sound)).dropped == []
+    assert Recording.model_validate(rest | vars(about)).dropped[0].backward_stamps == 1

@@ -116,7 +116,7 @@ def test_the_atlas_uses_the_papers_measure_and_scaling_removes_size(database: Da
     plain, scaled = atlas_of(database, SUTURE), atlas_of(database, SUTURE, scaled=True)
     rows = select(Demonstration).order_by(Demonstration.row)
     with database.reading() as session:
-        shapes = [atlas.shape_of(one.demo) for one in session.scalars(rows)]
+        shapes = [measuring.shape_of(one.demo) for one in session.scalars(rows)]
     np.testing.assert_allclose(far(plain)[0, 3], dtw(shapes[0], shapes[3]).total_mm / 100, atol=1e-4)
     one, other = (shape / shape[-1, 0] for shape in (shapes[0], shapes[3]))
     np.testing.assert_allclose(far(scaled)[0, 3], dtw(one, other).total_mm / 100, atol=1e-4)

@@ -7,7 +7,6 @@ import pytest
 from sqlalchemy import event, select
 from sqlalchemy.exc import IntegrityError
 
-from skills import library
 from skills.comparison.combining import Medoid
 from skills.db.models import Demonstration, DemonstrationOutcome, PolicyVersion, Release
 from skills.db.row_visibility import Only
@@ -15,6 +14,7 @@ from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.errors import Conflict
 from skills.formats.parsed import parse_recording
+from skills.library import perform as library
 from skills.library.comparison.scores import LEAST_DEMOS, score
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import keep_erasures, read_erasures

@@ -37,7 +37,14 @@ from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import withdraw_failed, withdraw_resting_on
 from skills.library.recordings.parts import choose_part
-from skills.library.recordings.recordings import Parser, Upload, find_recording, read_upload, stored_recording, storing
+from skills.library.recordings.recordings import (
+    Parser,
+    Upload,
+    find_recording,
+    read_upload,
+    store_upload,
+    stored_recording,
+)
 from skills.library.recordings.reports import report_on
 from skills.remedies import Action, Remedy
 from skills.schemas import DemoOutcome, OutcomeAsked
@@ -98,8 +105,11 @@ def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, par
     _check_style(database, cut)
     parsed = read_upload(upload, parse)
     made = make_demo(parsed, cut)
-    with storing(database, upload, parsed, actor, [locks.surgeon(cut.surgeon)]) as (session, stored, _):
+
+    def store(session: Session, stored: StoredRecording, _: bool) -> Added:
         return _store_demo(session, stored, made, cut, actor)
+
+    return store_upload(database, upload, parsed, actor, [locks.surgeon(cut.surgeon)], store)
 
 
 def add_demo(

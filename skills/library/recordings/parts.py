@@ -10,7 +10,7 @@ from skills.remedies import Action, Remedy
 from skills.schemas.demos import DemoIn
 
 
-class Part(NamedTuple):
+class ChosenPart(NamedTuple):
     """A request with the arm and the times of the part to cut, the name of that part, and the reason for the choice."""
 
     cut: DemoIn
@@ -18,7 +18,7 @@ class Part(NamedTuple):
     because: str
 
 
-def choose_part(parsed: ParsedContent, cut: DemoIn) -> Part:
+def choose_part(parsed: ParsedContent, cut: DemoIn) -> ChosenPart:
     """Return the part of a recording that a request names, or else the only proposed hand-off, or the whole.
 
     Raises:
@@ -29,9 +29,9 @@ def choose_part(parsed: ParsedContent, cut: DemoIn) -> Part:
     if timed and cut.segment is not None:
         raise BadSegment("Choose the part by segment, or by start_s and end_s, but not by both.")
     if timed:
-        return Part(cut, "the given times", "start_s or end_s was given")
+        return ChosenPart(cut, "the given times", "start_s or end_s was given")
     if cut.segment == "whole":
-        return Part(cut, "the whole recording", "segment=whole was given")
+        return ChosenPart(cut, "the whole recording", "segment=whole was given")
     fitting = {m.arm for m in parsed.recording.motions if cut.arm in (None, m.arm) and cut.topic in (None, m.topic)}
     proposed = [one for one in parsed.proposed if one.arm in fitting]
     if isinstance(cut.segment, int):
@@ -39,17 +39,17 @@ def choose_part(parsed: ParsedContent, cut: DemoIn) -> Part:
             raise BadSegment(f"There is no proposal {cut.segment}. {_list(proposed)}", segments=_numbered(proposed))
         return _proposal(cut, proposed, cut.segment)
     if not proposed:
-        return Part(cut, "the whole recording", "no hand-off is proposed in it; check that it holds exactly one")
+        return ChosenPart(cut, "the whole recording", "no hand-off is proposed in it; check that it holds exactly one")
     if len(proposed) > 1:
         raise SegmentNotNamed(_list(proposed), Remedy(Action.NAME_SEGMENT), segments=_numbered(proposed))
     return _proposal(cut, proposed, 1)
 
 
-def _proposal(cut: DemoIn, proposed: Sequence[Segment], number: int) -> Part:
+def _proposal(cut: DemoIn, proposed: Sequence[Segment], number: int) -> ChosenPart:
     one = proposed[number - 1]
     part = cut.model_copy(update={"arm": one.arm, "start_s": one.start_s, "end_s": one.end_s})
     why = "it is the only one" if cut.segment is None else f"segment={number} was given"
-    return Part(part, f"proposal {number} of {len(proposed)}", f"{why}: {one.reason}")
+    return ChosenPart(part, f"proposal {number} of {len(proposed)}", f"{why}: {one.reason}")
 
 
 def _numbered(proposed: Sequence[Segment]) -> list[dict[str, Any]]:  # JSON, in the numbers of a refusal

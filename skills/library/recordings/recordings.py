@@ -8,7 +8,6 @@ import hashlib
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from functools import partial
@@ -48,6 +47,7 @@ from skills.settings import Settings
 
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
 Parser = Callable[..., ParsedContent]  # `parse_recording`, or a callable that runs it in another process
+T = TypeVar("T")
 Content = TypeVar("Content", Recording, ParsedContent)
 BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
 
@@ -123,18 +123,26 @@ def store_recording(
     if surgeon is not None:
         with database.reading() as session:  # fails early, before the long reading; looked up again when writing
             find_surgeon(session, surgeon)
-    names = [] if surgeon is None else [locks.surgeon(surgeon)]
-    with storing(database, upload, read_upload(upload, parse), actor, names) as (session, stored, new):
+
+    def name_surgeon(session: Session, stored: StoredRecording, new: bool) -> tuple[StoredRecording, bool]:
         if surgeon is not None:
-            session.merge(RecordingSurgeon(recording_row=stored.row, surgeon_row=find_surgeon(session, surgeon).row))
-    return stored, new
+            row = find_surgeon(session, surgeon).row
+            session.merge(RecordingSurgeon(recording_row=stored.row, surgeon_row=row))
+        return stored, new
+
+    names = [] if surgeon is None else [locks.surgeon(surgeon)]
+    return store_upload(database, upload, read_upload(upload, parse), actor, names, name_surgeon)
 
 
-@contextmanager
-def storing(
-    database: Database, upload: Upload, parsed: ParsedContent, actor: str, names: Sequence[str] = ()
-) -> Iterator[tuple[Session, StoredRecording, bool]]:
-    """Store a recording and cache its content; yield the transaction, the row, and whether it is new to the actor.
+def store_upload(
+    database: Database,
+    upload: Upload,
+    parsed: ParsedContent,
+    actor: str,
+    names: Sequence[str],
+    then: Callable[[Session, StoredRecording, bool], T],
+) -> T:
+    """Store a recording and cache its content; return the result of `then`, which joins the transaction.
 
     Args:
         database: The database.
@@ -142,6 +150,7 @@ def storing(
         parsed: Their content.
         actor: The owner of the caller's key.
         names: Further names that the transaction locks, see `skills.library.operation.locks`.
+        then: Called with the transaction, the row, and whether it is new to the actor.
 
     Raises:
         Conflict: The bytes are already stored with other reading parameters.
@@ -150,9 +159,10 @@ def storing(
     ahead = send_ahead(database, upload)
     with database.writing([locks.recording(upload.sha256), *names]) as session:
         stored, new = put_recording(session, upload, parsed, entry, actor, ahead)
-        yield session, stored, new
+        result = then(session, stored, new)
     if entry is not None and entry.is_large:
         cache_content(database, stored, entry)
+    return result
 
 
 def preview(upload: Upload, parse: Parser = parse_recording) -> described.RecordingPreview:
