@@ -16,7 +16,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import skills
-from skills.learning.tube import Hands, advance, certified_poses
+from skills.learning.pose_step import Hands, advance
+from skills.learning.tube import certified_poses
 from skills.planning.handoff import PsmM
 from skills.report.figures import CELLS, GOAL, RECORDED, ROLLOUT
 from skills.seeds.recordings import sample_recordings

@@ -41,7 +41,7 @@ _CONTENTS = {
     "PoseStyle": "learning.pose_style",
     "learn_pose_style": "learning.pose_style",
     "PosePath": "learning.pose_style",
-    "next_pose": "learning.tube",
+    "next_pose": "learning.pose_step",
     "TubeCertificate": "learning.tube",
     "certify_tube": "learning.tube",
     "SuturePoint": "planning.plan",

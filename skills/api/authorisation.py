@@ -107,7 +107,7 @@ def needs(role: Role, *, whole: bool = False) -> Any:
 
 
 def open_to_all() -> Any:
-    """Declare a route without authentication; `skills.api.authentication.is_open` must list its path too."""
+    """Declare a route without authentication; `skills.api.gate.is_open` must list its path too."""
     return Depends(Needs(None))
 
 

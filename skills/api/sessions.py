@@ -42,7 +42,8 @@ from skills.db.models import PolicyVersion, Release, Surgeon
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError, TooMany
 from skills.fields import as_json
-from skills.learning.tube import CertifiedPoses, next_pose
+from skills.learning.pose_step import next_pose
+from skills.learning.tube import CertifiedPoses
 from skills.library.people import consent
 from skills.library.policies import releases
 from skills.library.policies.versions import next_json, policy_of, poses_of

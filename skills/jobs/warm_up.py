@@ -11,9 +11,10 @@ from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import certify
 from skills.learning.evaluation import dtw, measure
 from skills.learning.policy import learn_tabular, rollout_from
+from skills.learning.pose_step import next_pose
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.tube import certify_tube, next_pose
+from skills.learning.tube import certify_tube
 from skills.learning.tube_certificate import TubeLimits
 from skills.packing import palette_of
 

@@ -19,7 +19,7 @@ import numpy as np
 from rich.table import Table
 
 from skills.db.session import Database
-from skills.learning.tube import next_pose
+from skills.learning.pose_step import next_pose
 from skills.library.policies import releases
 from skills.library.policies.versions import policy_of, poses_of
 from skills.serving import environment

@@ -25,7 +25,9 @@ from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.packing import palette_of
 from skills.learning.policy import learn_tabular
 from skills.learning.pose_style import PosePath
-from skills.learning.tube import Hands, TubeLimits, advance, certify_tube, next_pose
+from skills.learning.pose_step import (Hands, advance, next_pose)
+from skills.learning.tube_certificate import (TubeLimits)
+from skills.learning.tube import (certify_tube)
 from skills.gridworld.reward import RewardLevels, sparse_reward
 IN = ("skills.learning", "skills.packing")
 loops = {loop.plain.__name__: loop for loop in LOOPS if loop.plain.__module__.startswith(IN)}

@@ -13,16 +13,9 @@ from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, BadSettings
 from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.learning import tube
+from skills.learning.pose_step import Hands, advance, next_pose
 from skills.learning.pose_style import PHASES, PosePath
-from skills.learning.tube import (
-    CertifiedPoses,
-    Hands,
-    Update,
-    advance,
-    certify_tube,
-    clear_tube,
-    next_pose,
-)
+from skills.learning.tube import CertifiedPoses, Update, certify_tube, clear_tube
 from skills.learning.tube_certificate import TubeClearance, TubeLimits
 from tests.learning.loops import run_both
 

@@ -30,7 +30,8 @@ from skills.gridworld.domain import FINISHED, OUTSIDE
 from skills.gridworld.grid import GridPath
 from skills.learning.evaluation import dtw
 from skills.learning.policy import rollout
-from skills.learning.tube import CertifiedPoses, PoseStep, certified_poses, next_pose
+from skills.learning.pose_step import PoseStep, next_pose
+from skills.learning.tube import CertifiedPoses, certified_poses
 from skills.library.operation import integrity
 from skills.library.operation.integrity import covered, learnt, posed
 from skills.library.operation.jobs import KEPT, RetrainingRequest
@@ -618,7 +619,7 @@ def about_next(
     rotation_xyzw: Sequence[float],
     phase: int | None,
 ) -> NextPose:
-    """Return the next pose of a version for a pose and its phase; see `skills.learning.tube.next_pose`."""
+    """Return the next pose of a version for a pose and its phase; see `skills.learning.pose_step.next_pose`."""
     step = next_pose(poses.path, position_mm, rotation_xyzw, phase, poses.tube.limits)
     named = {"version": version.version, "sha256": version.sha256, "frame": poses.frame, "tick_s": poses.tick_s}
     return NextPose.model_validate(named | next_json(poses, step))
