@@ -18,7 +18,7 @@ import pytest
 from typer.main import get_command
 
 import skills
-from skills.api.routes import demos, operating, pages, plans
+from skills.api.routes import demos, operating, pages, timelines
 from skills.cli import app
 from tests.api.conformance import conformance
 
@@ -38,7 +38,7 @@ COMMAND = re.compile(r"(?:^(?:\$ )?|`)skills ([a-z][^`\n#|]*)", re.MULTILINE)
 UNDESCRIBED = (
     pages.router,
     demos.page_router,
-    plans.timeline_page_router,
+    timelines.page_router,
     operating.sign_in_router,
     operating.reference_router,
 )

@@ -21,8 +21,8 @@ from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import coverage
 from skills.learning.policy import Learner, Policy, learn_tabular, next_step
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.library.policies import versions
-from skills.library.policies.training import joining_of
+from skills.library.policies import answers, versions
+from skills.library.policies.learning import joining_of
 from tests.by_day import some
 from tests.formats.bags import sample_folder
 from tests.gridworld.paths import WALKS, learnt
@@ -53,7 +53,7 @@ def recorded(cell_mm: float, learner: Learner) -> Policy:
 def as_npz(policy: Policy) -> io.BytesIO:
     """Return the service's arrays of a policy."""
     version: Any = SimpleNamespace(sha256="00" * 32, manifest=joining_of(policy))
-    return io.BytesIO(versions.arrays_of(version))
+    return io.BytesIO(answers.arrays_of(version))
 
 
 def as_json(policy: Policy) -> io.StringIO:
@@ -62,10 +62,10 @@ def as_json(policy: Policy) -> io.StringIO:
     about = rule | {
         "grid": {"origin_mm": grid.origin_mm, "cell_mm": grid.cell_mm, "shape": grid.shape},
         "waypoints": policy.path.states.tolist(),
-        versions.table_name(rule, "actions"): versions.actions_of(policy),
+        answers.table_name(rule, "actions"): answers.actions_of(policy),
     }
-    live = versions.live_actions_of(policy)
-    return io.StringIO(json.dumps(about | ({} if live is None else {versions.table_name(rule, "live_actions"): live})))
+    live = answers.live_actions_of(policy)
+    return io.StringIO(json.dumps(about | ({} if live is None else {answers.table_name(rule, "live_actions"): live})))
 
 
 def agrees(runner: Any, policy: Policy, states: NDArray[np.int64]) -> None:
@@ -93,7 +93,7 @@ def loaded(monkeypatch: pytest.MonkeyPatch) -> Callable[[Policy, str], Any]:
         monkeypatch.setattr(versions, "learnt", lambda _: policy)
         monkeypatch.setattr(versions, "covered", lambda _: coverage(policy))
         if form == "live":
-            monkeypatch.setattr(versions, "MAX_JSON_ACTIONS", 0)
+            monkeypatch.setattr(answers, "MAX_JSON_ACTIONS", 0)
         written = as_npz(policy) if form == "npz" else as_json(policy)
         return names()["from_npz" if form == "npz" else "from_json"](written)
 
@@ -134,9 +134,9 @@ def test_the_json_of_a_large_policy_has_its_live_actions_alone(loaded):
     """A recording of 4.0 million entries, with the limit as it is; the page states these sizes."""
     policy = recorded(2.0, PhaseQLearning())
     domain = policy.domain
-    assert domain.phases * policy.path.grid.n_states == 4_012_000 > versions.MAX_JSON_ACTIONS
-    assert versions.actions_of(policy) is None
-    live = versions.live_actions_of(policy)
+    assert domain.phases * policy.path.grid.n_states == 4_012_000 > answers.MAX_JSON_ACTIONS
+    assert answers.actions_of(policy) is None
+    live = answers.live_actions_of(policy)
     assert live is not None
     assert sum(len(box["actions"]) for box in live) == domain.n_rows == 64_258
     assert len(orjson.dumps(live)) == pytest.approx(0.18e6, rel=0.03)

@@ -20,7 +20,20 @@ from skills.api.openapi import complete
 from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import catalogue, demos, operating, pages, plans, policies
+from skills.api.routes import (
+    cards,
+    catalogue,
+    demos,
+    jobs,
+    operating,
+    pages,
+    plans,
+    playbacks,
+    policies,
+    timelines,
+    training,
+    tries,
+)
 from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
@@ -92,15 +105,17 @@ def create_app(settings: Settings) -> FastAPI:
         catalogue.router,
         demos.uploads,
         demos.router,
-        policies.job_router,
+        training.router,
+        tries.router,
+        jobs.router,
         policies.router,
         plans.router,
+        playbacks.router,
         plans.trajectory_router,
         plans.suture_point_router,
-        plans.picture_router,
-        plans.timeline_router,
-        policies.retraining_router,
-        policies.card_router,
+        playbacks.picture_router,
+        timelines.router,
+        cards.router,
         demos.dataset_router,
         demos.atlas_router,
         demos.score_router,
@@ -108,7 +123,7 @@ def create_app(settings: Settings) -> FastAPI:
         operating.reference_router,
         pages.router,
         demos.page_router,
-        plans.timeline_page_router,
+        timelines.page_router,
         operating.sign_in_router,
         catalogue.key_router,
     ):

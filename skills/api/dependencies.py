@@ -25,7 +25,7 @@ from skills.formats import BYTES, MEDIA_TYPES, media_type_of
 from skills.jobs import Engine
 from skills.library.operation.jobs import refuse_too_many
 from skills.library.recordings.recordings import Reader, Teller, Upload, check_digest
-from skills.schemas.requests import DIGEST, SLUG
+from skills.schemas.requests import DIGEST, JOB, SLUG
 from skills.settings import Settings
 
 
@@ -118,6 +118,9 @@ Actor = Annotated[str, Depends(_actor)]
 Slug = Annotated[str, Path(pattern=SLUG)]
 Digest = Annotated[str, Path(pattern=DIGEST)]
 Limit = Annotated[int, Query(ge=1, le=200)]
+JobId = Annotated[str, Path(pattern=JOB)]
+Version = Annotated[int, Path(ge=1, le=2**31)]
+Accept = Annotated[str, Header(max_length=500)]
 RowCursor = Annotated[int | None, Query(alias="cursor", ge=1, le=2**62)]
 SlugCursor = Annotated[str | None, Query(alias="cursor", pattern=SLUG)]
 

@@ -40,9 +40,10 @@ from skills.errors import PreconditionFailed, SkillsError, TooMany, UnknownForma
 from skills.formats import BYTES
 from skills.library.operation.jobs import ACTIVE, find_job, find_jobs, job_json
 from skills.library.operation.proofs import sign_files
-from skills.library.policies import versions
-from skills.library.policies.releases import outcomes_of
-from skills.library.policies.versions import Served, has_poses, pose_style_json, poses_of
+from skills.library.policies import answers
+from skills.library.policies.outcomes import outcomes_of
+from skills.library.policies.pose_styles import has_poses, pose_style_json, poses_of
+from skills.library.policies.versions import Served
 from skills.library.recordings.recordings import damaged
 from skills.settings import MEBIBYTE, Settings
 from skills.transparency import Note
@@ -229,10 +230,10 @@ class Encoded:
 
 def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> Body:
     if media_type == NPZ:
-        content = versions.arrays_of(policy)
+        content = answers.arrays_of(policy)
     else:
         arrays = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
-        content = orjson.dumps(versions.policy_json(policy, release) | {"arrays": arrays})
+        content = orjson.dumps(answers.policy_json(policy, release) | {"arrays": arrays})
     # A header and no field: the bytes, and so the ETag and what older clients verify, stay those of the policy.
     linked = release is not None and policy.poses is not None
     link = f'<{policy.suture}/pose-style>; rel="related"; title="pose style"' if linked else None

@@ -45,7 +45,8 @@ from skills.fields import as_json
 from skills.learning.tube import CertifiedPoses, next_pose
 from skills.library.people import consent
 from skills.library.policies import releases
-from skills.library.policies.versions import next_json, policy_of, poses_of
+from skills.library.policies.pose_styles import next_json, poses_of
+from skills.library.policies.versions import policy_of
 from skills.schemas.pose_styles import PoseIn
 from skills.settings import Settings
 

@@ -519,7 +519,7 @@ def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
         Corrupt: It does not match its digest.
     """
     from skills.library.operation.integrity import policy_identity  # here, because the library is slow to import
-    from skills.library.policies.versions import live_actions_of, table_name
+    from skills.library.policies.answers import live_actions_of, table_name
 
     try:
         policy = _policy(about, arrays, demo)

@@ -105,7 +105,7 @@ def test_above_its_limit_the_json_has_the_actions_of_the_domain_alone(tmp_path, 
     with serving(copy_of_trained(tmp_path)) as service:
         policy = service.client.policy(**KESTREL)
         entries = policy["phases"] * policy["coverage"]["n_states"]
-        monkeypatch.setattr("skills.library.policies.versions.MAX_JSON_ACTIONS", entries - 1)
+        monkeypatch.setattr("skills.library.policies.answers.MAX_JSON_ACTIONS", entries - 1)
         served = service.http.get(f"/policy-versions/{policy['sha256']}").json()
         assert served["actions"] is None
         assert "live_actions" not in policy

@@ -11,7 +11,7 @@ import pytest
 from skills.client import Problem
 from skills.learning.pose_style import PHASES
 from skills.library.people.keys import create_key
-from skills.library.policies.versions import FORMAT
+from skills.library.policies.pose_styles import FORMAT
 from skills.schemas.pose_styles import NextPose, PoseStyle
 from tests import backends
 from tests.api.posed import of_both_arms, of_pose_style

@@ -36,8 +36,8 @@ from skills.learning.policy import LEARNER_VERSION, describe_learner, learn_tabu
 from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation.jobs import PART, to_tell
 from skills.library.people.catalogue import put_surgeon, seed_catalogue
+from skills.library.policies.learning import Lesson, learn_style, lessons
 from skills.library.policies.retraining import request_retraining
-from skills.library.policies.training import Lesson, learn_style, lessons
 from skills.library.recordings.demos import upload_demo
 from skills.schemas.requests import DemoIn
 from skills.schemas.training import RetrainingIn

@@ -16,7 +16,7 @@ import skills
 from skills.client import Client
 from skills.client.policies import rebuilt
 from skills.errors import BadInput, Corrupt
-from skills.library.policies import versions
+from skills.library.policies import answers, versions
 from tests.api.service import KESTREL, POLICY
 from tests.library import cases
 
@@ -89,7 +89,7 @@ def test_no_live_action_of_a_large_policy_can_be_changed(fetched: Fetched, monke
     about, arrays, demo = fetched
     policy = rebuilt(about, arrays, demo)
     monkeypatch.setattr(versions, "MAX_JSON_ACTIONS", 0)
-    live = versions.live_actions_of(policy)
+    live = answers.live_actions_of(policy)
     large = about | {"actions": None, "live_actions": live}
     rebuilt(large, arrays, demo)
     for path in (("live_actions", 1, "low", 0), ("live_actions", 1, "size", 2), ("live_actions", 2, "actions", 7)):

@@ -21,8 +21,9 @@ from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans.plans import hand_of, trajectory_of
 from skills.library.policies import training
 from skills.library.policies.cards import card_of
+from skills.library.policies.combined import learnt_from, path_of
 from skills.library.policies.releases import release, standing
-from skills.library.policies.versions import find_by_digest, learnt_from, path_of
+from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import upload_demo, withdraw_demo
 from skills.schemas.requests import DemoIn
 from skills.settings import Settings

@@ -19,7 +19,7 @@ from skills.library.people import consent
 from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.consent import covered, may
 from skills.library.plans import plans
-from skills.library.policies import batches, releases, retraining, training, versions
+from skills.library.policies import batches, learning, releases, retraining, training, versions
 from skills.schemas.requests import ScoreIn
 from tests.library import cases
 from tests.library.cases import SUTURE
@@ -122,7 +122,7 @@ def test_in_a_batch_nobody_learns_from_whom_consent_was_withdrawn_before(
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
     learnt: list[str] = []
-    learn = training.learn_policy
+    learn = learning.learn_policy
 
     def withdrawing(*given: Any, **named: Any) -> Any:
         if not learnt:
@@ -130,7 +130,7 @@ def test_in_a_batch_nobody_learns_from_whom_consent_was_withdrawn_before(
         learnt.append("a style")
         return learn(*given, **named)
 
-    monkeypatch.setattr(training, "learn_policy", withdrawing)
+    monkeypatch.setattr(learning, "learn_policy", withdrawing)
     cases.work(database, part)
     assert (len(learnt), states_of(database, job).count("failed")) == (first, 14 - first)
 

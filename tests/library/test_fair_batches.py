@@ -9,8 +9,8 @@ import pytest
 from skills.db.models import PolicyVersion
 from skills.db.session import Database
 from skills.fields import as_json
-from skills.library.policies import batches, releases, versions
-from skills.library.policies.releases import fit_of_versions, not_worse
+from skills.library.policies import batches, fit, releases, versions
+from skills.library.policies.fit import fit_of_versions, not_worse
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.requests import DemoIn
 from skills.schemas.training import FitOnTheSame
@@ -159,13 +159,13 @@ def test_what_cannot_be_compared_is_worse(totals_mm: tuple[float, float]):
 
 
 def test_in_another_frame_nothing_is_compared():
-    path = releases.GridPath(releases.GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), releases.np.array([0, 1, 2]))
-    ways = [releases.PolicyWay(path.tip_mm, ("PSM2", frame)) for frame in ("PSM2_base", "jigsaws")]
-    one = releases.Taught("a" * 64, ("PSM2", "PSM2_base"), path)
-    found = releases.fit_of(*ways, [one])
+    path = fit.GridPath(fit.GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), fit.np.array([0, 1, 2]))
+    ways = [fit.PolicyWay(path.tip_mm, ("PSM2", frame)) for frame in ("PSM2_base", "jigsaws")]
+    one = fit.Taught("a" * 64, ("PSM2", "PSM2_base"), path)
+    found = fit.fit_of(*ways, [one])
     assert (not_worse(found), found.released_mm, found.trained_mm) == (False, None, None)
-    assert not_worse(releases.fit_of(ways[0], ways[0], [one]))
-    assert not not_worse(releases.fit_of(ways[0], ways[0], []))
+    assert not_worse(fit.fit_of(ways[0], ways[0], [one]))
+    assert not not_worse(fit.fit_of(ways[0], ways[0], []))
 
 
 def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(database: Database):

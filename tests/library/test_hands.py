@@ -16,6 +16,7 @@ from skills.library.operation.integrity import planned
 from skills.library.plans.plans import find_plan, trajectory_of
 from skills.library.policies import releases
 from skills.planning.handoff import turn
+from skills.planning.plan import driven_pass
 from tests.library import cases
 from tests.library.test_replay import gate, judged
 
@@ -79,8 +80,10 @@ def test_a_small_turn_may_be_held(database: Database):
 def test_a_version_checked_with_the_jaw_held_is_not_released(database: Database, monkeypatch: pytest.MonkeyPatch):
     cases.add_surgeon(database)
     cases.store(database, cases.upload(turning(), "application/vnd.mcap"), arm="PSM2")
-    real = releases.driven_pass
-    monkeypatch.setattr(releases, "driven_pass", lambda *given: replace(real(*given), orientation="demonstrated"))
+    monkeypatch.setattr(
+        "skills.library.policies.gate.driven_pass",
+        lambda *given: replace(driven_pass(*given), orientation="demonstrated"),
+    )
     version = cases.train(database)
     monkeypatch.undo()
     with (

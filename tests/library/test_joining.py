@@ -15,7 +15,7 @@ from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library.operation.integrity import covered, learnt
 from skills.library.policies import releases
-from skills.library.policies.releases import refusals
+from skills.library.policies.gate import refusals
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import near_limits, request_training
 from skills.schemas.training import RetrainingIn, TrainingIn

@@ -24,10 +24,11 @@ from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.library import perform as library
 from skills.library.operation import jobs, overview
+from skills.library.operation.integrity import learnt
 from skills.library.people.catalogue import find_surgeon, put_surgeon, seed_catalogue
 from skills.library.people.erasure import erase_surgeon
 from skills.library.policies import releases
-from skills.library.policies.versions import learnt, policy_of
+from skills.library.policies.versions import policy_of
 from skills.library.recordings.demos import add_demo, find_demo, withdraw_demo
 from skills.library.recordings.recordings import recording_bytes, store_recording
 from skills.schemas.requests import DemoIn

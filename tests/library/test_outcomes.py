@@ -21,7 +21,8 @@ from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.overview import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
-from skills.library.policies.releases import release, remedy, standing
+from skills.library.policies.gate import remedy
+from skills.library.policies.releases import release, standing
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256

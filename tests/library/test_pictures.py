@@ -16,6 +16,7 @@ from skills.library.operation.integrity import planned
 from skills.library.operation.jobs import cancel
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans import playbacks
+from skills.library.plans.pictures import draw_pictures, find_pictures
 from skills.library.plans.plans import trajectory_of
 from skills.planning.trajectory import time_parametrise
 from skills.settings import Settings
@@ -67,7 +68,7 @@ def drawn(database: Database) -> list[StoredPictures]:
 
 def refusal(database: Database, playback: StoredPlayback) -> str:
     with database.reading() as session, pytest.raises(NotDrawnYet) as caught:
-        playbacks.find_pictures(session, playback)
+        find_pictures(session, playback)
     return str(caught.value)
 
 
@@ -80,13 +81,13 @@ def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
     monkeypatch.setattr(film, "FRAMES_PER_PASS", 2)
     [job] = asked(database)
     assert job.id in refusal(database, playback)
-    store = playbacks.draw_pictures(database, job.request, Settings(database_url=database.url))
+    store = draw_pictures(database, job.request, Settings(database_url=database.url))
     for _ in range(2):  # the second time by a worker that does not know of the first
         with database.writing() as session:
             assert store(session, "test") == {"playback": playback.sha256}
     assert len(drawn(database)) == 1
     with database.reading() as session:
-        found = playbacks.find_pictures(session, playback)
+        found = find_pictures(session, playback)
     assert found.animation_mp4[4:8] == b"ftyp"
     assert found.animation_gif.startswith(b"GIF89a")
     assert all(png.startswith(b"\x89PNG") for png in (found.joints_png, found.clearance_png))

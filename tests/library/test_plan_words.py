@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from skills.library.plans.plans import hands_over, plan_in_words
-from skills.library.plans.playbacks import CHECK_VERSION, costs_most, headline
+from skills.library.plans.description import hands_over, plan_in_words
+from skills.library.plans.headline import CHECK_VERSION, costs_most, headline
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
 from skills.verification.monte_carlo import doubt
 from skills.verification.probabilities import JUDGE_VERSION, DoubtSettings

@@ -22,9 +22,9 @@ from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import HISTORY, inspect_installation
 from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo
-from skills.library.policies import training
+from skills.library.policies import learning, training
 from skills.library.policies.batches import retrain_part
-from skills.library.policies.versions import poses_of
+from skills.library.policies.pose_styles import poses_of
 from skills.library.recordings.demos import withdraw_demo
 from skills.remedies import Remedy
 from skills.settings import Settings
@@ -235,7 +235,7 @@ def test_a_batch_tries_a_style_again_whose_recording_cannot_be_read_now(
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
     with monkeypatch.context() as now:
-        now.setattr(training, "stored_recording", busy)
+        now.setattr(learning, "stored_recording", busy)
         with pytest.raises(Busy):
             retrain_part(database, part.request, Settings(database_url=database.url))
     assert states_of(database, job) == ["queued"]
@@ -262,7 +262,7 @@ def test_a_recording_that_is_not_cached_is_read_again(database: Database):
 def test_no_recording_is_read_where_the_other_arm_is_not_known(database: Database, monkeypatch: pytest.MonkeyPatch):
     cases.add_surgeon(database)
     add(database, turning())
-    monkeypatch.setattr(training, "stored_recording", lambda *_: pytest.fail("it was read"))
+    monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     assert beside(database, cases.train(database)) is None
 
 
@@ -272,7 +272,7 @@ def test_no_recording_is_read_without_consent(database: Database, monkeypatch: p
     job = cases.ask_training(database)
     with database.writing() as session:
         put_surgeon(session, "kestrel", NO_CONSENT, "test")
-    monkeypatch.setattr(training, "stored_recording", lambda *_: pytest.fail("it was read"))
+    monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     ended = cases.work(database, job)
     assert ended.state == "failed" and "consent" in (ended.error or "")
 

@@ -25,8 +25,9 @@ from skills.library.operation import inspection
 from skills.library.operation.inspection import Checked, inspect_policies
 from skills.library.operation.integrity import demo_identity, policy_identity, poses_identity_of
 from skills.library.people.catalogue import put_surgeon
+from skills.library.policies.learning import certified, lessons
 from skills.library.policies.relearning import compute_again, decoded
-from skills.library.policies.training import GATE_VERSION, certified, lessons
+from skills.library.policies.training import GATE_VERSION
 from skills.library.recordings.demos import mark_demo
 from skills.settings import Settings
 from tests import backends

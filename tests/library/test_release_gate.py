@@ -23,7 +23,7 @@ from skills.learning.certificate import NearLimits, certify, near_starts
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.library.policies import releases, retraining, training
+from skills.library.policies import gate, learning, releases, retraining, training
 from tests.formats.bags import sample_folder
 from tests.gridworld.paths import learnt
 from tests.library import cases
@@ -141,7 +141,7 @@ def reasons(policy: Policy) -> list[str]:
     """Return the reasons on the grid against a release of a policy."""
     certificate, covered = certify(policy)
     assert covered.share is not None
-    return releases.refusals(policy, certificate, near_starts(policy, covered.share, NearLimits(least_share=0.0)))
+    return gate.refusals(policy, certificate, near_starts(policy, covered.share, NearLimits(least_share=0.0)))
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_values_too_small_to_be_learnt_are_refused_with_a_gamma_that_does(learne
     certificate, _ = certify(policy)
     reason = reasons(policy)[1]
     assert reason.startswith(f"{certificate.faint} of them are so far from the path that their values, with gamma 0.1,")
-    assert "larger cells" in releases.remedy(reason)
+    assert "larger cells" in gate.remedy(reason)
     better = learn_tabular(reward, replace(learner, gamma=float(reason.rpartition(" gamma of ")[2])))
     assert reasons(better) == []
 
@@ -177,10 +177,10 @@ def test_a_rollout_that_is_not_the_demonstration_is_a_reason_of_its_own():
     assert "the rollout from the demonstrated start is not the demonstration" in reasons(still)
     certificate, covered = certify(policy)
     near = near_starts(policy, covered.share, NearLimits())
-    assert releases.refusals(policy, certificate, near) == []
+    assert gate.refusals(policy, certificate, near) == []
     unlike = replace(certificate, demonstration_reproduced=False)
-    assert len(releases.refusals(policy, unlike, near)) == 1
-    assert releases.refusals(learnt("an angle", phased=False), unlike, replace(near, share=0.0)) == []
+    assert len(gate.refusals(policy, unlike, near)) == 1
+    assert gate.refusals(learnt("an angle", phased=False), unlike, replace(near, share=0.0)) == []
 
 
 @pytest.mark.parametrize(
@@ -196,9 +196,9 @@ def test_a_rollout_that_is_not_the_demonstration_is_a_reason_of_its_own():
 def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, margin, words, path, way, monkeypatch):
     nearest = SimpleNamespace(tip_mm=(1, 2, 3), joint="pitch", unit="rad", limit=-0.8, value=value, margin=margin)
     driven = SimpleNamespace(beyond=2, samples=9, path=path, nearest_limit=nearest)
-    monkeypatch.setattr(releases, "driven_pass", lambda _policy, _demo: driven)
+    monkeypatch.setattr(gate, "driven_pass", lambda _policy, _demo: driven)
     demo = SimpleNamespace(frame="PSM2_base", instrument="400006")
-    found, (reason,) = releases.driven_or_refused(learnt("an angle"), demo)
+    found, (reason,) = gate.driven_or_refused(learnt("an angle"), demo)
     assert found is driven
     assert f"at (1.0, 2.0, 3.0) mm in PSM2_base {words}" in reason
     assert way in reason and "of 2 of 9 places" in reason
@@ -206,17 +206,17 @@ def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, marg
 
 def test_a_pass_that_cannot_be_checked_is_refused(monkeypatch):
     policy, demo = learnt("an angle"), SimpleNamespace(frame="PSM2_base", instrument="400006")
-    found, (reason,) = releases.driven_or_refused(policy, SimpleNamespace(frame="ECM"))
+    found, (reason,) = gate.driven_or_refused(policy, SimpleNamespace(frame="ECM"))
     assert found is None and "'ECM' is not the arm's base" in reason
     within = SimpleNamespace(beyond=0)
-    monkeypatch.setattr(releases, "driven_pass", lambda _policy, _demo: within)
-    assert releases.driven_or_refused(policy, demo) == (within, [])
+    monkeypatch.setattr(gate, "driven_pass", lambda _policy, _demo: within)
+    assert gate.driven_or_refused(policy, demo) == (within, [])
 
     def refusing(_policy: object, _demo: object) -> None:
         raise BadPlan("It is too short.")
 
-    monkeypatch.setattr(releases, "driven_pass", refusing)
-    found, (reason,) = releases.driven_or_refused(policy, demo)
+    monkeypatch.setattr(gate, "driven_pass", refusing)
+    found, (reason,) = gate.driven_or_refused(policy, demo)
     assert found is None and reason.endswith("not checked: It is too short")
 
 
@@ -242,7 +242,7 @@ def test_what_changed_during_a_training_forbids_storing_it(demo, others, why, ou
     session = SimpleNamespace(get=lambda _kind, row: rest[row])
     manifest = {} if outcomes == "success" else {"outcomes": "any"}
     finished = SimpleNamespace(lesson=SimpleNamespace(others=range(len(rest))), manifest=manifest)
-    refused = training._refusal(session, finished, first)
+    refused = learning._refusal(session, finished, first)
     if why is None or ("marked" in why and outcomes == "any"):
         assert refused is None
     else:

@@ -20,9 +20,11 @@ from skills.formats.verify import check_bag
 from skills.library.operation.history import newest_checkpoint, sign_history
 from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.plans import replay
-from skills.library.plans.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
-from skills.library.plans.playbacks import CHECK_VERSION
-from skills.library.plans.replay import check_doubt, cleared, replay_bag
+from skills.library.plans.description import plan_in_words
+from skills.library.plans.headline import CHECK_VERSION
+from skills.library.plans.plans import find_plan, plan_sutures, trajectory_of
+from skills.library.plans.replay import replay_bag
+from skills.library.plans.replay_gate import check_doubt, cleared
 from skills.library.policies import releases
 from skills.library.policies.versions import find_version
 from skills.library.recordings.demos import withdraw_demo

@@ -18,7 +18,7 @@ from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.policies import batches, retraining
 from skills.library.policies.batches import compare
-from skills.library.policies.training import learn_style
+from skills.library.policies.learning import learn_style
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.training import FitOnTheSame, PolicyFigures
 from tests.library import cases

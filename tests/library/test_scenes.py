@@ -21,11 +21,11 @@ from skills.learning.policy import Policy
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.learning.slip import FollowPolicy, draw_slips, follows, walk
 from skills.library.operation.integrity import covered, learnt, scene_digest
-from skills.library.policies import releases
-from skills.library.policies.releases import refusals
+from skills.library.policies import gate, releases
+from skills.library.policies.answers import about_rollout
+from skills.library.policies.gate import refusals
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import odds_limits
-from skills.library.policies.versions import about_rollout
 from skills.schemas.training import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
@@ -111,7 +111,7 @@ def test_the_gate_asks_for_finishing_and_touching_and_refuses_nan(finishing, tou
     assert bool(reasons) == refused
     for reason in reasons:
         assert "touches the scene with" in reason
-        assert "value-iteration" in releases.remedy(reason)
+        assert "value-iteration" in gate.remedy(reason)
 
 
 def test_a_policy_that_slips_too_often_is_stored_and_not_released(database):

@@ -27,7 +27,7 @@ from skills.api.authorisation import Caller, Role
 from skills.errors import UnknownFormat
 from skills.formats import READABLE
 from skills.library.operation.overview import StyleState
-from skills.library.plans.playbacks import error_called
+from skills.library.plans.headline import error_called
 
 HTML = "text/html"
 JSON = "application/json"

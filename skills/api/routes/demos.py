@@ -14,6 +14,7 @@ from sqlalchemy import select
 
 from skills.api.authorisation import Asking, erasing_is_for_admins, needs
 from skills.api.dependencies import (
+    Accept,
     Actor,
     Db,
     Digest,
@@ -42,7 +43,6 @@ from skills.api.responses import (
     stored_pieces,
 )
 from skills.api.routes.pages import PageRoute, Picked
-from skills.api.routes.policies import Accept
 from skills.db.models import StoredRewardMap
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats import BYTES, MEDIA_TYPES

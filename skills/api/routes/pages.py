@@ -11,20 +11,20 @@ from sqlalchemy.orm import Session
 
 from skills import errors
 from skills.api.authorisation import Asking, needs, open_to_all
-from skills.api.dependencies import Configured, Db, Digest, Limit, RowCursor, Slug, SlugCursor, Tell
+from skills.api.dependencies import Configured, Db, Digest, JobId, Limit, RowCursor, Slug, SlugCursor, Tell, Version
 from skills.api.pages import assets, build, drawings, render
 from skills.api.responses import JSON
-from skills.api.routes.policies import JobId, Version
 from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library.comparison import scores
 from skills.library.operation import jobs, overview
 from skills.library.people.catalogue import list_surgeons
-from skills.library.plans.plans import find_plan, followed_plan, hands_over, plan_in_words
+from skills.library.plans.description import hands_over, plan_in_words
+from skills.library.plans.plans import find_plan, followed_plan
 from skills.library.plans.playbacks import headline_of
-from skills.library.plans.replay import refusal_of_bag
+from skills.library.plans.replay_gate import refusal_of_bag
 from skills.library.policies import releases, retraining, versions
-from skills.library.policies.releases import outcomes_of
+from skills.library.policies.outcomes import outcomes_of
 from skills.library.recordings.demos import find_demo, shown_demo
 from skills.library.recordings.recordings import find_recording
 from skills.planning.handoff import Enters

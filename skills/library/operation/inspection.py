@@ -48,8 +48,9 @@ from skills.library.comparison.calibrations import read_calibration
 from skills.library.operation.history import Verified, verify_history
 from skills.library.operation.integrity import covered, demo_identity, planned, policy_identity, posed
 from skills.library.operation.jobs import identity_of
+from skills.library.policies.combined import path_of
+from skills.library.policies.pose_styles import poses_of_demonstrations
 from skills.library.policies.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
-from skills.library.policies.versions import path_of, poses_of_demonstrations
 from skills.library.recordings.recordings import Teller, alike, cached_content, read_entry, recording_bytes
 from skills.packing import canonical, sha256
 from skills.settings import Settings

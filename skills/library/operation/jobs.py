@@ -27,7 +27,8 @@ from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
 from skills.library.operation import locks
 from skills.library.people.consent import require
-from skills.library.policies.releases import Outcome, is_served
+from skills.library.policies.outcomes import Outcome
+from skills.library.policies.releases import is_served
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 

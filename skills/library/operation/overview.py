@@ -45,9 +45,9 @@ from skills.learning.policy import Policy
 from skills.library.operation.integrity import covered, learnt
 from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import shown_recording
-from skills.library.plans import playbacks
+from skills.library.plans.pictures import job_of_pictures
+from skills.library.policies.combined import learnt_from
 from skills.library.policies.releases import is_served, served
-from skills.library.policies.versions import learnt_from
 from skills.library.recordings.recordings import Teller
 
 RECENT = 500  # jobs in the quantiles of durations: enough for a meaningful 99th percentile
@@ -532,7 +532,7 @@ def playbacks_of(session: Session, plan: Plan) -> list[Played]:
 
 def _played(session: Session, playback: StoredPlayback) -> Played:
     drawn = session.scalar(select(StoredPictures.row).where(StoredPictures.playback_row == playback.row))
-    job = None if drawn else playbacks.job_of_pictures(session, playback)
+    job = None if drawn else job_of_pictures(session, playback)
     return Played(playback, drawn is not None, job)
 
 

@@ -35,24 +35,13 @@ from skills.library.operation import jobs, locks
 from skills.library.operation.jobs import RequestedJob, Store, identity_of
 from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import require
+from skills.library.plans.headline import errors_in_words
 from skills.library.plans.plans import find_plan, hand_of, plan_sutures
-from skills.library.plans.playbacks import (
-    check_playback,
-    errors_in_words,
-    find_playback,
-    headline_of,
-    playback_request,
-)
+from skills.library.plans.playbacks import check_playback, find_playback, headline_of, playback_request
 from skills.library.policies import releases
-from skills.library.policies.training import (
-    learn_style,
-    lessons,
-    near_limits,
-    odds_limits,
-    store_style,
-    training_request,
-    with_partners,
-)
+from skills.library.policies.gate import remedy
+from skills.library.policies.learning import learn_style, lessons, store_style, with_partners
+from skills.library.policies.training import near_limits, odds_limits, training_request
 from skills.library.recordings.demos import add_demo, choose_part, find_demo
 from skills.library.recordings.recordings import Teller, confined_reader, find_recording, stored_recording
 from skills.remedies import Remedy
@@ -348,7 +337,7 @@ def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:
     reasons = certificate["refused_because"]
     if not reasons:
         return _done("certify", f"{text} It passes the gate of a release.", version.sha256)
-    remedies = tuple(dict.fromkeys(releases.remedy(one) for one in reasons))
+    remedies = tuple(dict.fromkeys(remedy(one) for one in reasons))
     return TryStep(
         name="certify",
         state="refused",

@@ -35,8 +35,9 @@ from skills.library.operation import integrity, jobs, locks
 from skills.library.operation.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
 from skills.library.people.consent import refusal
 from skills.library.policies import releases
-from skills.library.policies.releases import fit_of, not_worse, shown_mm, taught, way_of
-from skills.library.policies.training import (
+from skills.library.policies.combined import refuse_unlike
+from skills.library.policies.fit import fit_of, not_worse, shown_mm, taught, way_of
+from skills.library.policies.learning import (
     Learnt,
     Lesson,
     Stored,
@@ -46,7 +47,7 @@ from skills.library.policies.training import (
     store_styles,
     with_partners,
 )
-from skills.library.policies.versions import LearntIn, Recipe, kept_of, learner_kept, recipes_of, refuse_unlike
+from skills.library.policies.served_settings import LearntIn, Recipe, kept_of, learner_kept, recipes_of
 from skills.library.recordings.demos import newest_demos
 from skills.library.recordings.recordings import Teller, confined_reader
 from skills.schemas.training import FitOnTheSame, PolicyFigures, StoredComparison

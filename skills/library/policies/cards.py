@@ -39,7 +39,7 @@ from skills.library.people import consent
 from skills.library.people.catalogue import find_suture_type
 from skills.library.policies import card_words as words
 from skills.library.policies import releases
-from skills.library.policies.versions import combined_of, learnt_from
+from skills.library.policies.combined import combined_of, learnt_from
 from skills.library.recordings.demos import full_report
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName

@@ -30,18 +30,10 @@ from skills.learning.tube import CertifiedPoses
 from skills.library.operation.integrity import learnt
 from skills.library.operation.jobs import TrainingRequest
 from skills.library.people.consent import refusal
-from skills.library.policies.training import (
-    ANY,
-    GATE_VERSION,
-    POSES_VERSION,
-    Learnt,
-    Lesson,
-    certified,
-    combined_lesson,
-    learn_style,
-    lessons,
-)
-from skills.library.policies.versions import combining_of
+from skills.library.policies.combined import combining_of
+from skills.library.policies.gate import GATE_VERSION
+from skills.library.policies.learning import ANY, Learnt, Lesson, certified, combined_lesson, learn_style, lessons
+from skills.library.policies.training import POSES_VERSION
 from skills.library.recordings.recordings import Teller, alike, recording_bytes
 from skills.packing import canonical
 from skills.settings import Settings

@@ -23,9 +23,10 @@ from skills.library.operation import jobs, locks
 from skills.library.operation.jobs import BATCH, KEPT, PART, PartRequest, RequestedJob, RetrainingRequest, did_nothing
 from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import require
-from skills.library.policies.releases import Outcome
-from skills.library.policies.training import GATE_VERSION, POSES_VERSION, learner_to_train
-from skills.library.policies.versions import Kept, Recipe, in_pieces, kept_of, learner_kept, recipes_of
+from skills.library.policies.gate import GATE_VERSION
+from skills.library.policies.outcomes import Outcome
+from skills.library.policies.served_settings import Kept, Recipe, in_pieces, kept_of, learner_kept, recipes_of
+from skills.library.policies.training import POSES_VERSION, learner_to_train
 from skills.library.recordings.demos import newest_demos
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy

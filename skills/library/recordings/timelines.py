@@ -23,7 +23,7 @@ from skills.errors import NotFound
 from skills.library.people.recorded import recording_for, shown_recording
 from skills.library.plans.plans import find_plan, motion_of, trajectory_of
 from skills.library.policies import versions
-from skills.library.policies.versions import poses_of
+from skills.library.policies.pose_styles import poses_of
 from skills.library.recordings.demos import demo_for, find_demo
 from skills.library.recordings.recordings import Teller, find_recording, stored_recording
 from skills.verification.timeline import (
