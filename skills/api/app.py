@@ -17,7 +17,7 @@ from skills import __version__
 from skills.api.authentication import Access, Gate
 from skills.api.metrics import Observed, ServiceMetrics
 from skills.api.openapi import complete
-from skills.api.policy_cache import AtHand, PolicyCache
+from skills.api.policy_cache import CachedPolicies, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
 from skills.api.routes import (
@@ -173,8 +173,8 @@ class Service(FastAPI):
         state = self.state
         failing = super().build_middleware_stack()
         assert isinstance(failing, ServerErrorMiddleware)  # the handler of status 500 is outermost, and stays so
-        at_hand = AtHand(failing.app, state.served, policies.get_policy, policies.router)
-        failing.app = Gate(at_hand, state.access, state.settings, state.database.history)
+        cached = CachedPolicies(failing.app, state.served, policies.get_policy, policies.router)
+        failing.app = Gate(cached, state.access, state.settings, state.database.history)
         return Observed(Headers(HeadAsGet(failing)), state.metrics)
 
 

@@ -28,7 +28,7 @@ from skills.library.operation.history import is_right, sign_history
 from skills.library.operation.proofs import first_head
 from skills.library.people import consent
 from skills.library.policies import versions
-from skills.library.policies.releases import STANDS
+from skills.library.policies.releases import NEWEST_RELEASE
 
 Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response, or `POSES`, or `SIGNATURE`
 
@@ -47,7 +47,7 @@ class Known:
     """A cached response: a style's policy, its release, and the database version at which both were valid."""
 
     body: Body
-    release: tuple[Any, ...]  # the row of the query `STANDS`; its last column is the policy's digest
+    release: tuple[Any, ...]  # the row of the query `NEWEST_RELEASE`; its last column is the policy's digest
     last_day: date | None  # of the surgeon's consent
     version: int | None
 
@@ -79,7 +79,7 @@ class PolicyCache:
                 await sweeping
             await self.changes.close()
 
-    def at_hand(self, surgeon: str, suture: str, media_type: str) -> Body | None:
+    def cached(self, surgeon: str, suture: str, media_type: str) -> Body | None:
         """Return the current policy of a style from the cache; None if that would need a query that blocks."""
         version = self.changes.version()  # read before the tables, so that a commit in between is not missed
         known = self._known.get((surgeon, suture, media_type))
@@ -87,7 +87,7 @@ class PolicyCache:
             return None
         if known.version != version:
             try:
-                if self.changes.first(STANDS, {"surgeon": surgeon, "suture": suture}) != known.release:
+                if self.changes.first(NEWEST_RELEASE, {"surgeon": surgeon, "suture": suture}) != known.release:
                     return None
             except Unasked:
                 return None
@@ -101,7 +101,7 @@ class PolicyCache:
             NotFound: The style does not exist, or has no released policy.
             Corrupt: The stored policy does not match the digest that was certified.
         """
-        return self.at_hand(surgeon, suture, media_type) or await self._read(surgeon, suture, media_type)
+        return self.cached(surgeon, suture, media_type) or await self._read(surgeon, suture, media_type)
 
     async def _read(self, surgeon: str, suture: str, media_type: str) -> Body:
         version = self.changes.version()  # read before the tables, so that a commit in between is not missed
@@ -133,7 +133,7 @@ class PolicyCache:
         kept = self._database.history.kept_head()
         with self._database.reading() as session:
             self._database.history.compare(session.connection(), kept)
-            release = session.execute(STANDS, {"surgeon": surgeon, "suture": suture}).first()
+            release = session.execute(NEWEST_RELEASE, {"surgeon": surgeon, "suture": suture}).first()
             known = self._known.get(key)
             if known is not None and release is not None and known.release == tuple(release) and not known.over:
                 return Known(known.body, known.release, known.last_day, None)
@@ -172,7 +172,7 @@ class PolicyCache:
         self._known.forget([key for key, known in self._known.items() if known.release[-1] in gone])
 
 
-class AtHand:
+class CachedPolicies:
     """ASGI middleware that answers GET of a released policy from the cache: no routing, but the route's authorisation.
 
     It stands between the authentication and the application. A request that needs a query, has an unusual header or is
@@ -205,7 +205,7 @@ class AtHand:
         if found is None or asked is None:
             return None
         media_type, if_none_match = asked
-        body = self._served.at_hand(found["surgeon"], found["suture"], media_type)
+        body = self._served.cached(found["surgeon"], found["suture"], media_type)
         if body is None:
             return None
         # read by the authorisation and by the metrics

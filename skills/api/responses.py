@@ -38,13 +38,14 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import PreconditionFailed, SkillsError, TooMany, UnknownFormat
 from skills.formats import BYTES
-from skills.library.operation.jobs import ACTIVE, find_job, find_jobs, job_json
+from skills.library.operation.jobs import ACTIVE, find_job, find_jobs
 from skills.library.operation.proofs import sign_files
 from skills.library.policies import answers
-from skills.library.policies.outcomes import outcomes_of
-from skills.library.policies.pose_styles import has_poses, pose_style_json, poses_of
+from skills.library.policies.outcomes import describe_job, describe_jobs
+from skills.library.policies.pose_styles import describe_pose_style, has_poses, poses_of
 from skills.library.policies.versions import Served
 from skills.library.recordings.recordings import damaged
+from skills.schemas import operation as schemas
 from skills.settings import MEBIBYTE, Settings
 from skills.transparency import Note
 
@@ -66,7 +67,7 @@ def json_of(said: Any, *, indented: bool = False) -> bytes:
 
 def _fields(said: Any) -> dict[str, Any]:
     if isinstance(said, BaseModel):
-        return said.model_dump()
+        return said.model_dump(mode="json", warnings=False)  # lists of arrays stand in place of tuples
     raise TypeError(f"{type(said)} is no JSON")
 
 
@@ -193,7 +194,7 @@ class Encoded:
         key = (policy.sha256, policy.version, policy.created_at, policy.poses.sha256 if policy.poses else None)
         body = self._kept.get(key)
         if body is None:
-            content = orjson.dumps(pose_style_json(policy, poses_of(policy)))
+            content = json_of(describe_pose_style(policy, poses_of(policy)))
             body = Body(content, JSON, tag_of(content))
             self._kept.put(key, body)
         return body
@@ -233,8 +234,8 @@ def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> 
         content = answers.arrays_of(policy)
     else:
         arrays = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
-        content = orjson.dumps(answers.policy_json(policy, release) | {"arrays": arrays})
-    # A header and no field: the bytes, and so the ETag and what older clients verify, stay those of the policy.
+        content = json_of(answers.describe_policy(policy, release, arrays))
+    # A header and no field, so that the bytes and the ETag stay those of the policy.
     linked = release is not None and policy.poses is not None
     link = f'<{policy.suture}/pose-style>; rel="related"; title="pose style"' if linked else None
     return Body(content, media_type, tag_of(content), link)
@@ -293,8 +294,9 @@ def stored(said: Any, new: bool, location: str | None = None) -> Response:
 
 def accepted(session: Session, job: Job, did: str) -> Response:
     """Return the response to a request for a job: 200 once it succeeded, else 202; `did` is the request's effect."""
-    said = job_json(job, outcomes_of(session, [job])[job.row], did)
-    return say(said, 200 if job.state == "succeeded" else 202, {"Location": f"/jobs/{job.id}"})
+    return say(
+        describe_job(session, job, did), 200 if job.state == "succeeded" else 202, {"Location": f"/jobs/{job.id}"}
+    )
 
 
 def say(said: Any, status: int = 200, headers: dict[str, str] | None = None) -> Response:
@@ -383,15 +385,13 @@ WATCH_S = 0.2
 ASKED_AGAIN_S = 1.0  # interval of the authorisation check: a stream ends within this and `authentication.REMEMBERED_S`
 AGAIN_S = 10.0
 
-State = dict[str, Any]
-
 
 class Watcher:
     """One stream: the last state of its job, None if it was erased, and the event that wakes the stream at a change."""
 
     def __init__(self, job: str) -> None:
         self.job = job
-        self.now: State | None = None
+        self.now: schemas.Job | None = None
         self.changed = asyncio.Event()
 
 
@@ -428,8 +428,8 @@ class Watching:
             while watcher.now is not None:
                 if watcher.now != told:
                     told, told_s = watcher.now, monotonic()
-                    yield b"event: job\ndata: " + orjson.dumps(told) + b"\n\n"
-                    if told["state"] not in ACTIVE:
+                    yield b"event: job\ndata: " + json_of(told) + b"\n\n"
+                    if told.state not in ACTIVE:
                         return
                 elif monotonic() - told_s >= self._heartbeat_s:
                     told_s = monotonic()
@@ -482,14 +482,13 @@ class Watching:
                         watcher.changed.set()
 
 
-def _look(database: Database, job: str) -> State:
+def _look(database: Database, job: str) -> schemas.Job:
     with database.reading() as session:
         found = find_job(session, job)
-        return job_json(found, outcomes_of(session, [found])[found.row])
+        return describe_job(session, found)
 
 
-def _look_at_all(database: Database, jobs: set[str]) -> dict[str, State]:
+def _look_at_all(database: Database, jobs: set[str]) -> dict[str, schemas.Job]:
     with database.reading() as session:
         found = find_jobs(session, jobs)
-        came_of = outcomes_of(session, found)
-        return {job.id: job_json(job, came_of[job.row]) for job in found}
+        return {job.id: job for job in describe_jobs(session, found)}

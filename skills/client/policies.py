@@ -48,11 +48,6 @@ PAUSES_S = (0.05, 0.5)  # between two polls of a job: the first pause, and the l
 EVENTS = "text/event-stream"
 JSON, NPZ = "application/json", "application/x-npz"
 # Fields of a version or of its response, which the digest of a policy does not cover.
-OF_THE_VERSION = (
-    *("version", "sha256", "created_at", "released_at", "released_by", "arrays"),
-    *("actions", "actions_joining", "live_actions", "live_actions_joining"),
-)
-FORMATS = (1, 2)  # of a policy, that this client can follow
 
 
 def steps_of(job: Job) -> list[TryStep]:
@@ -518,16 +513,16 @@ def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     Raises:
         Corrupt: It does not match its digest.
     """
-    from skills.library.operation.integrity import policy_identity  # here, because the library is slow to import
-    from skills.library.policies.answers import live_actions_of, table_name
+    from skills.db.packed import digest  # here, because the library is slow to import
+    from skills.library.policies.answers import live_actions_of
+    from skills.schemas.policies import PhaseActions, PolicyManifest
 
     try:
         policy = _policy(about, arrays, demo)
-        manifest = {name: value for name, value in about.items() if name not in OF_THE_VERSION}
-        whole = policy_identity(manifest, policy) == about["sha256"]
-        actions, live = about[table_name(about, "actions")], about.get(table_name(about, "live_actions"))
-        told = about.get("format", 1) in FORMATS and (actions is None or actions == policy.table().tolist())
-        told = told and live == live_actions_of(policy)
+        whole = PolicyManifest.model_validate(about).identity(digest(policy)) == about["sha256"]
+        actions, live = about["actions"], about["live_actions"]
+        told = actions is None or actions == policy.table().tolist()
+        told = told and (live and [PhaseActions(**one) for one in live]) == live_actions_of(policy)
     except Exception as error:  # data of another kind can raise any class
         raise Corrupt("This version of the client cannot verify the received policy; update the client.") from error
     if not (whole and told):

@@ -23,9 +23,10 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
-from skills.db import Base, Number, RowId, Sha256, now
+from skills.db import AsJson, Base, Number, RowId, Sha256, now
 from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
+from skills.schemas.training import StoredComparison
 
 LONGEST_REASON = 2000  # characters
 
@@ -110,7 +111,7 @@ class StyleToRetrain(Base):
     tries: Mapped[int] = mapped_column(default=0)
     policy_row: Mapped[int | None] = mapped_column(ForeignKey("policy_versions.row"), index=True)
     reason: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
-    comparison: Mapped[dict[str, Any] | None]
+    comparison: Mapped[StoredComparison | None] = mapped_column(AsJson(StoredComparison))
     ended_at: Mapped[datetime | None]
 
     demonstration: Mapped[Demonstration] = relationship(lazy="joined", innerjoin=True)

@@ -4,8 +4,7 @@
 - `given`: responses. Their parts are in `recordings`, `policies` and `comparison`, their common base and types of
   fields are here. A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
 
-The library writes the JSON of a response, next to the use case of its noun (`plan_json` in `library/plans/plans.py`).
-Rows store most of it as it was computed.
+A use case returns the model of its answer; rows store parts of it as typed columns of JSON (`skills.db.AsJson`).
 
 Lengths are mm; the frame of a position is in a field of its own.
 """

@@ -60,12 +60,12 @@ def test_a_commit_that_changes_no_release_is_looked_at_once(trained: Service, mo
         with trained.database.writing() as session:
             put_surgeon(session, "heron", {}, "test")
         for _ in range(3):
-            assert trained.http.portal.call(cache.at_hand, *KESTREL.values(), JSON) is body
+            assert trained.http.portal.call(cache.cached, *KESTREL.values(), JSON) is body
         assert len(asked) <= commits
     assert asked
 
 
-def test_what_is_at_hand_is_asked_for_without_reading_the_tables(trained: Service, monkeypatch):
+def test_what_is_cached_is_asked_for_without_reading_the_tables(trained: Service, monkeypatch):
     seeing(trained)
     read_and_kept(trained, JSON)
     tag = trained.http.get(POLICY).headers["etag"]
@@ -74,12 +74,12 @@ def test_what_is_at_hand_is_asked_for_without_reading_the_tables(trained: Servic
         assert trained.http.get(POLICY, headers=headers).status_code == status
 
 
-def test_nothing_is_at_hand_while_changes_cannot_be_seen(trained: Service, monkeypatch):
+def test_nothing_is_cached_while_changes_cannot_be_seen(trained: Service, monkeypatch):
     seeing(trained)
     read_and_kept(trained, JSON)
     cache = trained.app.state.served
     monkeypatch.setattr(cache.changes, "version", lambda: None)
-    assert trained.http.portal.call(cache.at_hand, *KESTREL.values(), JSON) is None
+    assert trained.http.portal.call(cache.cached, *KESTREL.values(), JSON) is None
     with trained.database.writing() as session:
         withdraw_all(session, find_surgeon(session, "kestrel"), "test")
     assert trained.http.get(POLICY).status_code == 404

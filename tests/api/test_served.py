@@ -241,7 +241,7 @@ def version(service: Service) -> int | None:
 def read_and_kept(service: Service, kind: str) -> Body:
     """Request a policy, and return its cached body."""
     assert service.http.get(POLICY, headers={"Accept": kind}).status_code == 200
-    body = service.http.portal.call(service.app.state.served.at_hand, *KESTREL.values(), kind)
+    body = service.http.portal.call(service.app.state.served.cached, *KESTREL.values(), kind)
     assert body is not None
     return body
 
@@ -376,7 +376,7 @@ def test_the_format_is_what_the_client_weighs_most(accept: str, given: str | Non
         assert negotiate(accept) == given
 
 
-def test_a_policy_at_hand_is_not_given_to_whoever_may_not_see_it(trained: Service):
+def test_a_policy_cached_is_not_given_to_whoever_may_not_see_it(trained: Service):
     assert served(trained.http) == 1
     with trained.database.writing() as session:
         put_surgeon(session, "heron", {}, "test")

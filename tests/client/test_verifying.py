@@ -16,7 +16,7 @@ import skills
 from skills.client import Client
 from skills.client.policies import rebuilt
 from skills.errors import BadInput, Corrupt
-from skills.library.policies import answers, versions
+from skills.library.policies import answers
 from tests.api.service import KESTREL, POLICY
 from tests.library import cases
 
@@ -88,14 +88,14 @@ def test_nothing_that_is_said_of_it_can_be_changed(fetched: Fetched, of: int):
 def test_no_live_action_of_a_large_policy_can_be_changed(fetched: Fetched, monkeypatch: pytest.MonkeyPatch):
     about, arrays, demo = fetched
     policy = rebuilt(about, arrays, demo)
-    monkeypatch.setattr(versions, "MAX_JSON_ACTIONS", 0)
-    live = answers.live_actions_of(policy)
+    monkeypatch.setattr(answers, "MAX_JSON_ACTIONS", 0)
+    live = [box.model_dump() for box in answers.live_actions_of(policy) or ()]
     large = about | {"actions": None, "live_actions": live}
     rebuilt(large, arrays, demo)
     for path in (("live_actions", 1, "low", 0), ("live_actions", 1, "size", 2), ("live_actions", 2, "actions", 7)):
         with pytest.raises(Corrupt):
             rebuilt(changed(large, path), arrays, demo)
-    for none in ({"live_actions": (live or [])[:-1]}, {"live_actions": None}):
+    for none in ({"live_actions": live[:-1]}, {"live_actions": None}):
         with pytest.raises(Corrupt):
             rebuilt(large | none, arrays, demo)
 

@@ -80,7 +80,7 @@ HOT: dict[str, Callable[[Session], object]] = {
     "a version by its digest": lambda s: versions.find_by_digest(s, versions.policy_of(s, *STYLE).policy.sha256),
     "a training": lambda s: training.request_training(s, TrainingIn(surgeon=STYLE[0], suture=STYLE[1]), "test"),
     "a surgeon's stale styles": lambda s: retraining.choose_styles(s, RetrainingIn(surgeon=STYLE[0], only_stale=True)),
-    "where what was learnt stands": lambda s: s.execute(learning.STANDING, {"demonstrations": [1, 2, 3]}).all(),
+    "where what was learnt stands": lambda s: s.execute(learning.DEMO_STATES, {"demonstrations": [1, 2, 3]}).all(),
     "what is known already": lambda s: s.execute(learning.KNOWN, {"digests": ["0" * 64, "1" * 64]}).all(),
     "what some styles serve": lambda s: s.execute(batches.SERVED, {"demonstrations": [1, 2, 3]}).all(),
     "jobs": lambda s: jobs.list_jobs(s, 10, 50, None),
@@ -107,7 +107,7 @@ def test_what_is_asked_often_is_answered_by_an_index(filled: Database, what: str
 
 
 PAGES: dict[str, Callable[[Session, int], object]] = {
-    "what is served": lambda s, most: [answers.summary_json(one) for one in versions.list_served(s, most, 0)],
+    "what is served": lambda s, most: [answers.summarise(one) for one in versions.list_served(s, most, 0)],
     "the styles": lambda s, most: matrix(s, limit=most),
     "the styles to plan with": released_styles,
 }

@@ -19,7 +19,7 @@ from skills.library.people import consent
 from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.consent import covered, may
 from skills.library.plans import plans
-from skills.library.policies import batches, learning, releases, retraining, training, versions
+from skills.library.policies import batches, learning, releases, retraining, versions
 from skills.schemas.requests import ScoreIn
 from tests.library import cases
 from tests.library.cases import SUTURE
@@ -81,7 +81,7 @@ def test_consent_withdrawn_during_training_stores_and_releases_nothing(
 ):
     cases.add_demo(database)
     job = cases.ask_training(database, release=True)
-    midway(monkeypatch, training, "learn_policy", lambda: agree(database, NO_TRAINING))
+    midway(monkeypatch, learning, "learn_policy", lambda: agree(database, NO_TRAINING))
     ended = cases.work(database, job)
     assert ended.state == "failed"
     assert "does not cover training" in ended.error

@@ -119,9 +119,9 @@ def test_hysteresis_is_kept_with_the_path_and_learnt_and_planned_with(database: 
     lost_mm = list(discretisation_rmse(tip_mm, PAPER_GRID, 0.25))
     assert demo.report["discretisation_rmse_mm"] == lost_mm != plain.report["discretisation_rmse_mm"]
     version = cases.train(database, demos=[demo.sha256], release=True)
-    assert version.manifest["metrics"]["discretisation_rmse_mm"] == lost_mm
-    assert version.manifest["metrics"]["exact_states"] == len(path.states)
-    assert cases.add_plan(database).about["path"] == "fitted"
+    assert version.manifest.metrics.discretisation_rmse_mm == tuple(lost_mm)
+    assert version.manifest.metrics.exact_states == len(path.states)
+    assert cases.add_plan(database).about.path == "fitted"
 
 
 def test_a_hysteresis_that_cannot_be_meant_leaves_no_row(database: Database):
@@ -263,15 +263,15 @@ def test_the_first_page_shows_what_the_manifest_states(database: Database):
     cases.train(database)
     with database.reading() as session:
         manifest = session.scalars(select(PolicyVersion.manifest)).one()
-        assert tile(session) == (manifest["waypoints"], pytest.approx(manifest["coverage"]["mean_share"]))
+        assert tile(session) == (manifest.waypoints, pytest.approx(manifest.coverage.mean_share))
 
 
 def tile(session: Session) -> tuple[list[int], float]:
     ((_, styles),) = overview.matrix(session).rows
     shown = next(style.shown for style in styles if style.shown is not None)
     manifest = session.scalars(select(PolicyVersion.manifest)).one()
-    assert shown.grid_shape == tuple(manifest["grid"]["shape"])
-    assert shown.dtw_total_mm == pytest.approx(manifest["metrics"]["dtw_total_mm"])
+    assert shown.grid_shape == manifest.grid.shape
+    assert shown.dtw_total_mm == pytest.approx(manifest.metrics.dtw_total_mm)
     return shown.waypoints, shown.mean_share
 
 
@@ -279,8 +279,8 @@ def test_what_value_iteration_finds_may_be_released(database: Database):
     cases.add_demo(database)
     version = cases.train(database, learner=ValueIteration())
     assert version.releasable
-    assert version.manifest["learner"] == "value-iteration"
-    assert version.manifest["metrics"]["dtw_total_mm"] == 0
+    assert version.manifest.learner == "value-iteration"
+    assert version.manifest.metrics.dtw_total_mm == 0
     with database.writing() as session:
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
     with database.reading() as session:

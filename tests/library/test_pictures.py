@@ -16,14 +16,15 @@ from skills.library.operation.integrity import planned
 from skills.library.operation.jobs import cancel
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans import playbacks
-from skills.library.plans.pictures import draw_pictures, find_pictures
 from skills.library.plans.plans import trajectory_of
+from skills.library.plans.playback_pictures import draw_pictures, find_pictures
 from skills.planning.trajectory import time_parametrise
 from skills.settings import Settings
 from skills.simulation import film, pictures
 from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
+from tests.library.verdicts import verdict_on
 from tests.planning.motions import hand_off, ideal_playback
 from tests.planning.test_transfers import BESIDE
 
@@ -36,8 +37,9 @@ REPORT = {
 
 def store_playback(session: Session, plan: Plan, sha256: str, measured: Playback) -> StoredPlayback:
     """Store a playback and request its pictures, as a worker does with the verdict."""
+    report = verdict_on(plan.sha256, measured.trajectory, measured)
     row = StoredPlayback(
-        sha256=sha256, plan=session.get_one(Plan, plan.row), feasible=True, report=REPORT, measured=measured
+        sha256=sha256, plan=session.get_one(Plan, plan.row), feasible=True, report=report, measured=measured
     )
     session.add(row)
     session.flush()
@@ -134,7 +136,7 @@ def test_they_are_erased_with_what_they_show(database: Database, playback: Store
         if what == "surgeon":
             dropped = erase_surgeon(session, "kestrel", "test")
         else:
-            dropped = erase_demo(session, playback.plan.policy.manifest["demos"][0], "test")
+            dropped = erase_demo(session, playback.plan.policy.manifest.demos[0], "test")
     assert unfinished and set(unfinished) <= set(dropped)
     assert drawn(database) == asked(database) == []
 

@@ -137,7 +137,7 @@ def test_several_demonstrations_give_one_pose_style_at_one_place(database: Datab
     version = cases.train(database, demos=[one.sha256 for one in demos])
     with database.reading() as session:
         version = session.get_one(PolicyVersion, version.row)
-        poses, at = poses_of(version), version.manifest["combined"]["at"]
+        poses, at = poses_of(version), version.manifest.combined.at
         (place,) = [one.demo for one in version.demonstrations if one.sha256 == at]
     assert np.abs(poses.path.tip_mm[[0, -1]] - place.tip_mm[[0, -1]]).max() < 1e-9
     assert poses.path.spread_mm.max() > 0.0

@@ -22,12 +22,13 @@ from typing import Any, get_args
 from fastapi import Request, Response
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from pydantic_core import to_jsonable_python
 
 from skills.api.authorisation import Caller, Role
 from skills.errors import UnknownFormat
 from skills.formats import READABLE
 from skills.library.operation.overview import StyleState
-from skills.library.plans.headline import error_called
+from skills.library.plans.headline import describe_error
 
 HTML = "text/html"
 JSON = "application/json"
@@ -206,7 +207,7 @@ FILTERS = {
     "degrees": degrees,
     "outline": outline,
     "state_mark": STATE_MARKS.__getitem__,
-    "error_called": error_called,
+    "describe_error": describe_error,
     "state_words": STATE_WORDS.__getitem__,
     "job_mark": JOB_MARKS.__getitem__,
 }
@@ -235,6 +236,7 @@ def templates() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= FILTERS
+    made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": to_jsonable_python}  # values and models too
     return made
 
 

@@ -96,7 +96,7 @@ def _card(db: Database, find: Callable[[Session], PolicyVersion]) -> Card:
 
 
 def _content(card: Card, *, as_page: bool) -> bytes:
-    return card_page(card).encode() if as_page else json_of(card.written(), indented=True)
+    return card_page(card).encode() if as_page else json_of(card.facts, indented=True)
 
 
 def _answer(card: Card, as_page: bool, if_none_match: str | None) -> Response:

@@ -1,7 +1,7 @@
 """Routes of jobs: their state, their events, and cancelling them."""
 
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 from fastapi import Request, Response
 
@@ -22,11 +22,10 @@ from skills.api.responses import (
     Watching,
     say,
 )
-from skills.db.session import Database
 from skills.library.operation import jobs as asked
 from skills.library.operation import locks
-from skills.library.operation.jobs import job_json, to_tell
-from skills.library.policies.outcomes import outcomes_of
+from skills.library.operation.jobs import to_tell
+from skills.library.policies.outcomes import describe_job, describe_jobs
 from skills.schemas.given import Page
 from skills.schemas.operation import Job
 from skills.settings import MEBIBYTE
@@ -48,15 +47,14 @@ def list_jobs(
     """List jobs, the newest first."""
     with db.reading() as session:
         found = asked.list_jobs(session, limit, cursor, state, kind)
-        came_of = outcomes_of(session, found)
-        said = [job_json(job, came_of[job.row]) for job in found]
-        return give.page(said, limit, found[-1].row if found else None)
+        return give.page(describe_jobs(session, found), limit, found[-1].row if found else None)
 
 
 @router.get("/jobs/{job}", dependencies=[needs("reader")], **gives(Job, 404))
 def get_job(job: JobId, db: Db, give: Giving) -> Response:
     """Return a job."""
-    return give(_look(db, job))
+    with db.reading() as session:
+        return give(describe_job(session, asked.find_job(session, job)))
 
 
 @router.get("/jobs/{job}/events", dependencies=[needs("reader")], **EVENTS)
@@ -75,13 +73,7 @@ def cancel_job(job: JobId, db: Db, jobs: Jobs, actor: Actor) -> Response:
     with db.writing([locks.job(row)]) as session:
         cancelled = asked.cancel(session, job, actor)
         told = to_tell(session, cancelled)
-        said = job_json(cancelled, outcomes_of(session, [cancelled])[cancelled.row])
+        said = describe_job(session, cancelled)
     for row, attempt in told:
         jobs.cancel(row, attempt)
     return say(said)
-
-
-def _look(db: Database, job: str) -> dict[str, Any]:
-    with db.reading() as session:
-        found = asked.find_job(session, job)
-        return job_json(found, outcomes_of(session, [found])[found.row])

@@ -35,12 +35,12 @@ from skills.errors import UnknownFormat
 from skills.formats.replay_bag import rows_of_pass
 from skills.library.operation import overview
 from skills.library.plans import plans
-from skills.library.plans.description import plan_json, plan_summary_json
+from skills.library.plans.description import describe_stored, summarise
 from skills.library.plans.plans import find_suture_points, motion_of, trajectory_of
 from skills.library.plans.reach import map_style
 from skills.library.plans.replay import replay_bag
 from skills.library.plans.replay_comparison import compare_with_plan
-from skills.library.plans.replay_gate import conditions_of
+from skills.library.plans.replay_gate import ReplayConditions
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
 from skills.schemas.given import Page, SuturePoints
@@ -58,8 +58,7 @@ router = router_of(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
 def make_plan(body: PlanIn, db: Db, actor: Actor) -> Response:
     """Stack a style's grid world at suture points."""
     row, created = plans.plan_sutures(db, body, actor)
-    with db.reading() as session:
-        return stored(plan_json(plans.find_plan(session, row.sha256)), created, f"/plans/{row.sha256}")
+    return stored(describe_stored(row), created, f"/plans/{row.sha256}")
 
 
 @router.get("/plans", dependencies=[needs("reader")], **gives_page(Page[PlanSummary], 410))
@@ -67,7 +66,7 @@ def list_plans(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None
     """List plans, the newest first, each with its newest playback."""
     with db.reading() as session:
         found = overview.newest_plans(session, cursor, limit)
-        written = [plan_summary_json(plan, played) for plan, played in found]
+        written = [summarise(plan, played) for plan, played in found]
         return give.page(written, limit, found[-1][0].row if found else None)
 
 
@@ -75,7 +74,7 @@ def list_plans(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None
 def get_plan(plan: Digest, db: Db, give: Giving) -> Response:
     """Return a plan with its paths, while the surgeon's consent covers training."""
     with db.reading() as session:
-        return give(plan_json(plans.followed_plan(session, plan)))
+        return give(describe_stored(plans.followed_plan(session, plan)))
 
 
 @router.post("/reach", dependencies=[needs("trainer")], **says(Reach, 404, 409, 410))
@@ -86,7 +85,7 @@ def map_reach(body: ReachIn, db: Db) -> Response:
     and `in doubt` next to a limit. Several passes, and the arms' errors, are left to plan and playback. Nothing is
     stored.
     """
-    return say(map_style(db, body).model_dump(mode="json"))
+    return say(map_style(db, body))
 
 
 suture_point_router = router_of(tags=["plans"])
@@ -110,7 +109,7 @@ def read_suture_points(upload: Incoming, asked: Annotated[SuturePointsUpload, Qu
     `is_goal` proposes the exits as goals of passes: there the needle comes out and is handed over. A suture point of a
     plan takes `position_mm`, and as its rotation `turn_xyzw` if the style was demonstrated at the first of them.
     """
-    return say(find_suture_points(upload, asked.arm, asked.frame, read).model_dump(mode="json"))
+    return say(find_suture_points(upload, asked.arm, asked.frame, read))
 
 
 trajectory_router = router_of(tags=["plans"])
@@ -190,7 +189,7 @@ def _contents(
     settings: Settings,
 ) -> bytes:
     if media_type == BAG:
-        return replay_bag(db, plan, pass_index=pass_index, handoff=handoff, **conditions_of(settings))
+        return replay_bag(db, plan, ReplayConditions.of(settings, handoff), pass_index)
     with db.reading() as session:
         motion = motion_of(session, plan)
     trajectory = trajectory_of(motion)

@@ -23,8 +23,8 @@ from skills.formats import BYTES
 from skills.library.operation import locks
 from skills.library.operation.jobs import QUEUED, did_nothing
 from skills.library.plans import plans, playbacks
-from skills.library.plans.pictures import find_pictures, request_pictures
-from skills.library.plans.playbacks import find_playback, playback_json, shown_playback
+from skills.library.plans.playback_pictures import find_pictures, request_pictures
+from skills.library.plans.playbacks import describe_playback, find_playback, shown_playback
 from skills.schemas.playbacks import Playback, PlaybackIn
 from skills.settings import MEBIBYTE
 from skills.verification.playback import Pictures
@@ -50,9 +50,7 @@ def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configure
 def get_playback(playback: Digest, db: Db, give: Giving, settings: Configured) -> Response:
     """Return the simulator's verdict on a plan."""
     with db.reading() as session:
-        row = playbacks.find_playback(session, playback)
-        written = playback_json(row, playbacks.headline_of(row, settings))
-        return give(written | {"policy": playbacks.standing_of(session, row)})
+        return give(describe_playback(session, find_playback(session, playback), settings))
 
 
 picture_router = router_of(prefix="/playbacks/{playback}", tags=["plans"], max_body_size=MEBIBYTE)

@@ -41,9 +41,9 @@ from skills.learning.policy import next_step
 from skills.library.operation import locks
 from skills.library.operation.integrity import learnt
 from skills.library.people.catalogue import find_surgeon, find_suture_type
-from skills.library.policies import releases, versions
-from skills.library.policies.answers import about_rollout, summary_json, version_json
-from skills.library.policies.pose_styles import about_next, poses_of
+from skills.library.policies import answers, releases, versions
+from skills.library.policies.answers import summarise
+from skills.library.policies.pose_styles import find_next, poses_of
 from skills.schemas.given import Page, SignedEnvelope
 from skills.schemas.policies import NextStep, Policy, PolicySummary, Rollout, RolloutIn
 from skills.schemas.policies import Version as GivenVersion
@@ -69,7 +69,7 @@ def list_policies(
     """List the styles that serve a policy."""
     with db.reading() as session:
         found = versions.list_served(session, limit, cursor, surgeon, suture)
-        return give.page([summary_json(one) for one in found], limit, found[-1].row if found else None)
+        return give.page([summarise(one) for one in found], limit, found[-1].row if found else None)
 
 
 @router.head("/policies/{surgeon}/{suture}", dependencies=[needs("reader")], include_in_schema=False)
@@ -131,7 +131,9 @@ def list_versions(
     """List the versions of a style, the newest first."""
     with db.reading() as session:
         found = versions.list_versions(session, surgeon, suture, limit, cursor)
-        return give.page([version_json(row) for row in found], limit, found[-1].version if found else None)
+        return give.page(
+            [GivenVersion.model_validate(row) for row in found], limit, found[-1].version if found else None
+        )
 
 
 @router.get(
@@ -199,7 +201,7 @@ def release(
         if if_match is not None:
             _refuse_overtaken(session, encoded, surgeon, suture, if_match)
         released = releases.release(session, policy, actor, constant_turn_deg=settings.constant_turn_deg)
-        return say(summary_json(released))
+        return say(summarise(released))
 
 
 @router.delete("/policies/{surgeon}/{suture}/release", dependencies=[needs("releaser")], **ends(404, 409, 410, 412))
@@ -220,8 +222,7 @@ def withdraw(surgeon: Slug, suture: Slug, db: Db, request: Request, actor: Actor
 def roll_out(surgeon: Slug, suture: Slug, body: RolloutIn, db: Db) -> Response:
     """Follow the policy from a position to the goal."""
     with db.reading() as session:
-        found = about_rollout(versions.choose(session, surgeon, suture, body.version), body.start_mm)
-        return say(found.model_dump(mode="json"))
+        return say(answers.roll_out(versions.choose(session, surgeon, suture, body.version), body.start_mm))
 
 
 @router.post("/policies/{surgeon}/{suture}/next", dependencies=[needs("reader")], **says(NextStep | NextPose, 404, 410))
@@ -231,11 +232,10 @@ def next_action(surgeon: Slug, suture: Slug, body: NextIn, db: Db) -> Response:
         policy = versions.policy_of(session, surgeon, suture).policy
         if body.rotation_xyzw is not None:
             poses = poses_of(policy)
-            found = about_next(policy, poses, body.position_mm, body.rotation_xyzw, body.phase)
-            return say(found.model_dump(mode="json"))
+            return say(find_next(policy, poses, body.position_mm, body.rotation_xyzw, body.phase))
         step = next_step(learnt(policy), body.position_mm, body.phase)
-        about = {"version": policy.version, "sha256": policy.sha256, "frame": policy.manifest["frame"]}
-        return say(NextStep(**about, **vars(step)).model_dump(mode="json"))
+        name = {"version": policy.version, "sha256": policy.sha256, "frame": policy.manifest.frame}
+        return say(NextStep.model_validate(name | vars(step)))
 
 
 @router.websocket("/policies/{surgeon}/{suture}/session", dependencies=[needs("reader")])

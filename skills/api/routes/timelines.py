@@ -16,7 +16,6 @@ from skills.api.pages import render
 from skills.api.responses import JSON, Giving
 from skills.api.routes.pages import PageRoute
 from skills.errors import UnknownFormat
-from skills.fields import as_json
 from skills.formats import MCAP
 from skills.formats.bag_writer import timeline_mcap
 from skills.library.recordings.timelines import Source, check_export, chosen, motion_named, timeline_of
@@ -50,7 +49,7 @@ def get_timeline(source: Source, digest: Digest, db: Db, tell: Tell, give: Givin
             check_export(session, source, digest)
     found = timeline_of(db, source, digest, tell)
     if not mcap:
-        return give({"source": source, "sha256": digest, "timeline": as_json(found)})
+        return give(MotionTimeline(source=source, sha256=digest, timeline=found))
     given = give.bytes(timeline_mcap(found, f"{source}/{digest}"), MCAP)
     given.headers["Content-Disposition"] = f'attachment; filename="{source}-{digest[:12]}-to-look-at.mcap"'
     return given

@@ -22,9 +22,9 @@ from skills.api.responses import (
     accepted,
 )
 from skills.library.operation import locks
-from skills.library.operation.jobs import PART, count, job_json, to_tell
-from skills.library.policies.outcomes import outcomes_of, outcomes_of_styles
-from skills.library.policies.retraining import find_retraining, list_styles, request_retraining, retrained_json
+from skills.library.operation.jobs import PART, count, to_tell
+from skills.library.policies.outcomes import describe_job, describe_styles
+from skills.library.policies.retraining import find_retraining, list_styles, request_retraining
 from skills.library.policies.training import near_limits, odds_limits, request_training
 from skills.schemas.training import Retraining, RetrainingIn, TrainingIn
 from skills.settings import MEBIBYTE
@@ -79,7 +79,6 @@ def get_retraining(
     with db.reading() as session:
         found = find_retraining(session, job)
         styles = list_styles(session, found, limit, cursor, state)
-        about = job_json(found, outcomes_of(session, [found])[found.row]) | {"styles": count(session, found.row)}
-        came_of = outcomes_of_styles(session, styles)
-        items = [retrained_json(style, came_of[style.row]) for style in styles]
-        return give.page(items, limit, styles[-1].row if styles else None, **about)
+        described = dict(describe_job(session, found)) | {"styles": count(session, found.row)}
+        items = describe_styles(session, styles)
+        return give.page(items, limit, styles[-1].row if styles else None, **described)

@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import now, rfc3339
+from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_event
@@ -27,10 +27,10 @@ from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
 from skills.library.operation import locks
 from skills.library.people.consent import require
-from skills.library.policies.outcomes import Outcome
 from skills.library.policies.releases import is_served
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
+from skills.schemas.training import StoredComparison
 
 BATCH, PART = "retraining", "retraining-part"
 EXPORT, PICTURES = "dataset", "pictures"
@@ -76,10 +76,10 @@ def changed_since(session: Session, batch: int) -> set[int]:
     return {row for row, compared, now in session.execute(done.where(*mine)) if now != _served_then(compared)}
 
 
-def _served_then(comparison: dict[str, Any]) -> str | None:
+def _served_then(comparison: StoredComparison) -> str | None:
     """Return the digest of the version that a style served when a batch ended it."""
-    served = comparison["trained"] if comparison["now_released"] else comparison["released"]
-    return None if served is None else str(served["sha256"])
+    served = comparison.trained if comparison.now_released else comparison.released
+    return None if served is None else served.sha256
 
 
 def count_serving(session: Session, batch: int) -> tuple[int, int]:
@@ -148,7 +148,7 @@ QUEUED = "A new job is queued."  # `RequestedJob.did` of a new job
 JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 
 
-KEPT = "kept"  # `joins` of a batch in which each style keeps the joining rule of the policy that it serves
+JOIN_AS_SERVED = "as served"  # `joins` of a batch in which each style keeps the joining rule of its served policy
 
 
 class TrainingRequest(TypedDict):
@@ -183,7 +183,7 @@ class RetrainingRequest(TypedDict):
     poses: int
     near: dict[str, float]
     odds: dict[str, float]
-    joins: str | None  # `KEPT`; None where the request names a learner
+    joins: str | None  # `JOIN_AS_SERVED`; None where the request names a learner
     seed: int
     release: bool
     styles: NotRequired[int]
@@ -403,21 +403,3 @@ def cancel(session: Session, job_id: str, actor: str) -> Job:
     session.refresh(job)
     record_event(session, actor, "cancel", f"job-{job.kind}", job.id)
     return job
-
-
-def job_json(row: Job, outcome: Outcome, did: str | None = None) -> dict[str, Any]:
-    """Return a job's JSON, with its outcome and the effect of the request that it answers."""
-    return {
-        "id": row.id,
-        "kind": row.kind,
-        "state": row.state,
-        "progress": row.progress,
-        "request": row.request,
-        "result": outcome.result,
-        "served": outcome.served,
-        "did": did,
-        "error": row.error,
-        "created_at": rfc3339(row.created_at),
-        "started_at": rfc3339(row.started_at),
-        "ended_at": rfc3339(row.ended_at),
-    }

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Select, case, exists, func, select, text
+from sqlalchemy import JSON, ColumnElement, Select, case, exists, func, select, text, type_coerce
 from sqlalchemy.orm import Session
 
 from skills.db import now
@@ -45,7 +45,7 @@ from skills.learning.policy import Policy
 from skills.library.operation.integrity import covered, learnt
 from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import shown_recording
-from skills.library.plans.pictures import job_of_pictures
+from skills.library.plans.playback_pictures import job_of_pictures
 from skills.library.policies.combined import learnt_from
 from skills.library.policies.releases import is_served, served
 from skills.library.recordings.recordings import Teller
@@ -372,7 +372,7 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     wanted = {**newest_version, **released}
     # Columns and not entities, of which a page has hundreds; and of manifests the part that is shown.
     shown = [("grid", "shape"), ("waypoints",), ("coverage", "mean_share"), ("metrics", "dtw_total_mm")]
-    manifest = [by.manifest[names] for names in shown]
+    manifest = [type_coerce(by.manifest, JSON)[names] for names in shown]
     others = select(func.max(PolicyDemonstration.demonstration_row)).where(PolicyDemonstration.policy_row == by.row)
     about = select(by.row, by.version, by.demonstration_row, others.scalar_subquery(), *manifest)
     told = {row: rest for row, *rest in session.execute(about.where(by.row.in_(wanted.values())))}

@@ -67,15 +67,14 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         NoHandOff: The plan would have no hand-off, and such a plan was not requested.
     """
     style = style_of(database, request.surgeon, request.suture, request.version)
-    plan, learnt_in, sha = stacked(request, style), style.learnt_in, style.sha256
-    trajectory = trajectory_of(plan)
+    plan, sha = stacked(request, style), style.sha256
     identity = plan_identity(sha, plan)
-    about = describe_plan(plan, trajectory, learnt_in)
+    about = describe_plan(plan, trajectory_of(plan), style.learnt_in)
     with database.writing([locks.surgeon(request.surgeon)]) as session:
         # Consent may have ended, or a demonstration been withdrawn, while the plan was computed.
         policy = versions.followable(versions.find_by_digest(session, sha))
         if request.version is None and (changes := policy.objections):
-            raise Conflict(f"The demonstration that the plan would follow {changes[0]}; plan again.")
+            raise Conflict(f"The demonstration that the plan would follow {changes[0].text}; plan again.")
         # An equal plan has the same digest, so a repeated request returns the stored row.
         known = session.scalar(select(Plan).where(Plan.sha256 == identity))
         if known is not None:

@@ -51,7 +51,7 @@ def map_style(database: Database, request: ReachIn) -> Reach:
         counts=(x, y, z),
         rotations=rotations,
         places=found,
-        in_words=in_words(found),
+        in_words=describe_reach(found),
     )
 
 
@@ -60,7 +60,7 @@ def _counts(size_mm: tuple[float, float, float], step_mm: float) -> list[int]:
     return [floor(size / step_mm + 1e-9) + 1 for size in size_mm]
 
 
-def in_words(places: list[ReachPlace]) -> str:
+def describe_reach(places: list[ReachPlace]) -> str:
     """Return the result as sentences: how many places are possible, and what limits most of the others."""
     yes = sum(one.reach == "yes" for one in places)
     words = f"{yes} of {len(places)} places can be planned, each in a plan of its own."
@@ -68,8 +68,8 @@ def in_words(places: list[ReachPlace]) -> str:
     if limits:
         name, count = limits.most_common(1)[0]
         words += f" Most others are refused for {CALLED.get(name, f'the limits of {name}')} ({count})."
-    doubt = sum(one.reach == "in doubt" for one in places)
-    return words + (f" {doubt} are so near to a limit that only a plan decides." if doubt else "")
+    undecided = sum(one.reach == "in doubt" for one in places)
+    return words + (f" {undecided} are so near to a limit that only a plan decides." if undecided else "")
 
 
 CALLED = {

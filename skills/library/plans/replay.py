@@ -9,7 +9,9 @@ first checkpoint of the history that covers its verdict.
 
 import hashlib
 import json
-from typing import Any, Literal
+from typing import Any
+
+from pydantic import TypeAdapter
 
 from skills.db.models import Plan, PolicyVersion, StoredPlayback
 from skills.db.packed import digest
@@ -26,16 +28,15 @@ from skills.formats.replay_bag import (
 from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VERDICT
 from skills.library.operation import proofs
 from skills.library.operation.integrity import learnt, learnt_in, planned
-from skills.library.plans.description import describe_plan, plan_in_words
-from skills.library.plans.headline import counted_as, errors_in_words, not_judged
+from skills.library.plans.description import describe_motion, describe_plan
+from skills.library.plans.headline import counted_as, describe_errors, not_judged
 from skills.library.plans.plans import find_plan
-from skills.library.plans.replay_gate import cleared
+from skills.library.plans.replay_gate import ReplayConditions, cleared
 from skills.library.policies.combined import learnt_from
 from skills.planning.handoff import JAW_CLOSED_RAD
-from skills.planning.plan import CONSTANT_TURN_DEG
-from skills.planning.trajectory import Trajectory
+from skills.schemas.plans import PlanDescription
+from skills.schemas.playbacks import Verdict
 from skills.transparency import Note
-from skills.verification.arm_errors import ArmErrors
 
 LIMITS = (
     "Certified on its grid alone: coverage and grid_certificate list the checks. They do not cover the arm's "
@@ -50,25 +51,15 @@ USE = "Research use only; not a medical device. Never replay it on or near a per
 
 
 def replay_bag(
-    database: Database,
-    plan_sha256: str,
-    *,
-    errors: ArmErrors,
-    lower_bound: float,
-    constant_turn_deg: float = CONSTANT_TURN_DEG,
-    pass_index: int | None = None,
-    handoff: Literal["none"] | None = None,
+    database: Database, plan_sha256: str, conditions: ReplayConditions, pass_index: int | None = None
 ) -> bytes:
     """Return the replay bag of a plan, or of one of its passes, as the bytes of a zip archive.
 
     Args:
         database: The database with the plan.
         plan_sha256: The plan's digest.
-        errors: The errors of the arms that the installation states, see `check_doubt`.
-        lower_bound: The least probability, by its lower bound, with which every pass has to succeed.
-        constant_turn_deg: The angle by which a constant orientation may depart from the recorded one.
+        conditions: The conditions of the export.
         pass_index: Export this pass alone, counted from 0; None: all of them.
-        handoff: "none" asks for the bag of a plan without a hand-off.
 
     Raises:
         NotFound: There is no such plan.
@@ -78,23 +69,24 @@ def replay_bag(
         Busy: The history cannot be signed now.
         BadSettings: The signing key cannot be read.
     """
-    asked: dict[str, Any] = {"errors": errors, "lower_bound": lower_bound, "constant_turn_deg": constant_turn_deg}
     with database.reading() as session:
         row = find_plan(session, plan_sha256)
-        verdict = cleared(session, row, handoff=handoff, **asked)
-        plan, demo, policy = planned(row), learnt_from(row.policy), row.policy
-        learnt(policy)
-        trajectory = verdict.measured.trajectory
-        papers = {PLAN: _plan(row, trajectory), VERDICT: _verdict(row, verdict), POLICY: _policy(policy)}
+        plan, policy = planned(row), row.policy
+        verdict = cleared(session, row, plan, conditions)
+        partner, jaw_rad = (demo := learnt_from(policy)).partner, demo.jaw_rad
+        trajectory, report = verdict.measured.trajectory, verdict.report
+        # From its verified value, and not the description stored with it.
+        about = describe_plan(plan, trajectory, learnt_in(policy))
+        papers = {PLAN: _plan(row, about), VERDICT: _verdict(row, verdict), POLICY: _policy(policy)}
         rows = (("plans", row.row), ("playbacks", verdict.row), ("policy_versions", policy.row))
-    if digest(trajectory) != papers[VERDICT]["report"]["trajectory"]:
+    if digest(trajectory) != report.trajectory:
         raise Corrupt("A stored motion is not the one that its verdict judged; restore it from a backup.")
     arms = arms_of(
         trajectory,
         arm=plan.arm,
         frame=plan.frame,
-        other=None if demo.partner is None else demo.partner.arm,
-        jaw_rad=held_jaw_rad(demo.jaw_rad, plan.instrument),
+        other=None if partner is None else partner.arm,
+        jaw_rad=held_jaw_rad(jaw_rad, plan.instrument),
         pass_index=pass_index,
     )
     members = {name: _written(paper) for name, paper in papers.items()}
@@ -102,7 +94,7 @@ def replay_bag(
         {"use": USE, "plan": row.sha256, "before_each_pass": BY_HAND, "passes": timetable(trajectory, arms)}
     )
     head = proofs.head_over(database, rows)
-    members[README] = _readme(papers[PLAN], papers[VERDICT]["report"], arms, head).encode()
+    members[README] = _readme(row, about, report, arms, head).encode()
     for arm in arms:
         members |= folder_of(arm, row.sha256)
     members[SIGNATURE] = proofs.sign_files(
@@ -111,74 +103,66 @@ def replay_bag(
         {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
         kind="replay-bag",
         plan=row.sha256,
-        verdict=papers[VERDICT]["sha256"],
-        policy=papers[POLICY]["sha256"],
-        trajectory=papers[VERDICT]["report"]["trajectory"],
+        verdict=verdict.sha256,
+        policy=policy.sha256,
+        trajectory=report.trajectory,
     )
     bag = seal(members)
     with database.reading() as session:  # again: consent or release may have changed while the bag was composed
-        again = find_plan(session, row.sha256)
-        cleared(session, again, handoff=handoff, **asked)
+        cleared(session, find_plan(session, row.sha256), plan, conditions)
     return bag
-
-
-# ---- the gate ---------------------------------------------------------------------------------------------------
 
 
 # ---- the documents in the bag -----------------------------------------------------------------------------------
 
 
-def _plan(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
-    """Return the plan as the API describes it, from its verified value and not from the description stored with it."""
-    policy = plan.policy
+def _plan(row: Plan, about: PlanDescription) -> dict[str, Any]:
+    policy = row.policy
     return {
         "use": USE,
-        "sha256": plan.sha256,
+        "sha256": row.sha256,
         "surgeon": policy.surgeon.slug,
         "suture": policy.suture,
         "policy": {"version": policy.version, "sha256": policy.sha256},
-        **(about := describe_plan(planned(plan), trajectory, learnt_in(policy))),
-        "in_words": plan_in_words(about),
+        **about.model_dump(mode="json"),
+        "in_words": describe_motion(about),
     }
 
 
-def _verdict(plan: Plan, played: StoredPlayback) -> dict[str, Any]:
+def _verdict(row: Plan, played: StoredPlayback) -> dict[str, Any]:
     return {
         "use": USE,
         "sha256": played.sha256,
-        "plan": plan.sha256,
-        "policy": plan.policy.sha256,
+        "plan": row.sha256,
+        "policy": row.policy.sha256,
         "feasible": played.feasible,
-        "report": played.report,
+        "report": TypeAdapter(Verdict).dump_python(played.report, mode="json"),  # of which its digest is
     }
 
 
 def _policy(policy: PolicyVersion) -> dict[str, Any]:
-    """Return the policy's manifest with the limits of its use."""
-    return {
-        "use": USE,
-        "limits": LIMITS,
-        "version": policy.version,
-        "sha256": policy.sha256,
-        **policy.manifest,
-    }
+    """Return the policy's verified manifest with the limits of its use."""
+    learnt(policy)
+    name = {"use": USE, "limits": LIMITS, "version": policy.version, "sha256": policy.sha256}
+    return name | policy.manifest.model_dump(mode="json")
 
 
 def _written(paper: dict[str, Any]) -> bytes:
     return json.dumps(paper, indent=2, sort_keys=True, allow_nan=False).encode() + b"\n"
 
 
-def _readme(plan: dict[str, Any], report: dict[str, Any], arms: tuple[ArmMotion, ...], head: Note) -> str:
+def _readme(row: Plan, about: PlanDescription, report: Verdict, arms: tuple[ArmMotion, ...], head: Note) -> str:
     """Return the text of the bag's README: its contents, and the figures of each arm to check before it moves."""
-    under, stated_by = report["doubt"]["under"][0], report["stated_by"]
-    errors = ArmErrors(**under["errors"])
+    under, policy = report.doubt.under[0], row.policy
+    errors = under.errors
     well = "succeed" if counted_as(under) == "hand-over" else "stay within reach and clear"
-    about = [
-        f"A needle hand-off for replay: plan {plan['sha256']},",
-        f"surgeon {plan['surgeon']}, {plan['suture']}, policy version {plan['policy']['version']}.",
-        plan["in_words"],
+    lines = [
+        f"A needle hand-off for replay: plan {row.sha256},",
+        f"surgeon {policy.surgeon.slug}, {policy.suture}, policy version {policy.version}.",
+        describe_motion(about),
         "",
-        f"Every pass is likely enough to {well} with {errors_in_words(errors.name)}, as the {stated_by} stated them:",
+        f"Every pass is likely enough to {well} with {describe_errors(errors.name)}, "
+        f"as the {report.stated_by} stated them:",
         f"{errors.in_words}.",
         f"Not judged: {', '.join(not_judged(under))}.",
         "With greater errors it was not judged: compare these with your arms.",
@@ -190,14 +174,14 @@ def _readme(plan: dict[str, Any], report: dict[str, Any], arms: tuple[ArmMotion,
         "",
         f"History {head.checkpoint.origin}: {head.checkpoint.size} leaves, root {head.checkpoint.root.hex()}",
     ]
-    if plan["orientation"] == "assumed tool-down":
-        about += [
+    if about.orientation == "assumed tool-down":
+        lines += [
             "",
             "The demonstration had no orientation. The tool is ASSUMED to point straight down: check its orientation.",
         ]
     for arm in arms:
-        about += ["", *_arm_lines(arm, plan["arm"], hands=len(arms) > 1)]
-    return "\n".join([*about, ""])
+        lines += ["", *_arm_lines(arm, about.arm, hands=len(arms) > 1)]
+    return "\n".join([*lines, ""])
 
 
 def _arm_lines(arm: ArmMotion, planned_arm: str, *, hands: bool) -> list[str]:

@@ -1,11 +1,9 @@
 """The comparison of a recorded replay with a pass of its plan."""
 
-from typing import Any
-
 import numpy as np
 from sqlalchemy.orm import Session
 
-from skills.arrays import Floats
+from skills.arrays import Floats, xyz
 from skills.errors import BadPlan
 from skills.formats.replay_bag import (
     rows_of_pass,
@@ -14,11 +12,12 @@ from skills.learning.evaluation import TIE_BREAK, dtw
 from skills.library.operation.integrity import planned
 from skills.library.plans.plans import followed_plan, trajectory_of
 from skills.library.recordings.demos import shown_demo
+from skills.schemas.playbacks import Comparison
 
 POINTS = 1000  # ours, for either path: one every 0.25 mm of a long pass, and 24 MB to align the two
 
 
-def compare_with_plan(session: Session, plan_sha256: str, demo_sha256: str, pass_index: int = 0) -> dict[str, Any]:
+def compare_with_plan(session: Session, plan_sha256: str, demo_sha256: str, pass_index: int = 0) -> Comparison:
     """Align a recorded replay with a pass of its plan, and return the distances between the two tip paths, in mm.
 
     The paths are aligned as a whole (dynamic time warping), so the two clocks need not agree; the recording has to be
@@ -47,20 +46,20 @@ def compare_with_plan(session: Session, plan_sha256: str, demo_sha256: str, pass
     meant = trajectory.tip_mm[rows_of_pass(trajectory, pass_index)]
     apart_mm = dtw(_thinned(demo.tip_mm), _thinned(meant)).differences_mm
     distance_mm = np.linalg.norm(apart_mm, axis=1)
-    return {
-        "plan": of_plan.sha256,
-        "demo": of_demo.sha256,
-        "pass": pass_index,
-        "mean_mm": float(distance_mm.mean()),
-        "max_mm": float(distance_mm.max()),
-        "start_mm": float(np.linalg.norm(demo.tip_mm[0] - meant[0])),
-        "end_mm": float(np.linalg.norm(demo.tip_mm[-1] - meant[-1])),
-        "dtw_mean_mm": apart_mm.mean(axis=0).tolist(),
-        "rmse_mm": np.sqrt((apart_mm**2).mean(axis=0)).tolist(),
-        "planned_s": float(np.ptp(trajectory.stamps_s[trajectory.pass_index == pass_index])),
-        "recorded_s": float(demo.stamps_s[-1]),
-        "tie_break": TIE_BREAK,
-    }
+    return Comparison.model_construct(  # by the names of the fields: `pass` is a keyword of Python
+        plan=of_plan.sha256,
+        demo=of_demo.sha256,
+        pass_index=pass_index,
+        mean_mm=float(distance_mm.mean()),
+        max_mm=float(distance_mm.max()),
+        start_mm=float(np.linalg.norm(demo.tip_mm[0] - meant[0])),
+        end_mm=float(np.linalg.norm(demo.tip_mm[-1] - meant[-1])),
+        dtw_mean_mm=xyz(apart_mm.mean(axis=0)),
+        rmse_mm=xyz(np.sqrt((apart_mm**2).mean(axis=0))),
+        planned_s=float(np.ptp(trajectory.stamps_s[trajectory.pass_index == pass_index])),
+        recorded_s=float(demo.stamps_s[-1]),
+        tie_break=TIE_BREAK,
+    )
 
 
 def _thinned(path_mm: Floats) -> Floats:

@@ -1,7 +1,10 @@
-"""Demonstrations that a policy is learnt from: one, or several combined into one path."""
+"""Demonstrations that a policy is learnt from: one, or several combined into one path.
+
+A combined path that is none of the demonstrations is stored only as the policy's path. To get more of it, combine the
+demonstrations again, which gives the same result; `skills verify` compares the resulting path with the policy's.
+"""
 
 from collections.abc import Sequence
-from typing import Any
 
 from sqlalchemy.orm import Session
 
@@ -9,11 +12,10 @@ from skills.comparison.combining import COMBININGS, Combined, Combining, Corrido
 from skills.db.models import Demonstration, PolicyVersion, Surgeon
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, Conflict
-from skills.fields import as_json
 from skills.gridworld.grid import GridPath
 from skills.library.recordings.demos import find_demo, newest_demos
 from skills.remedies import Action, Remedy
-from skills.schemas import policies as described
+from skills.schemas.policies import Combined as CombinedFigures
 
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
 
@@ -83,13 +85,13 @@ def refuse_unlike(demonstrations: Sequence[Demonstration]) -> None:
             )
 
 
-def combining_of(described: dict[str, Any]) -> Combining:
-    """Return the combination that a JSON object describes."""
-    return COMBININGS[described["kind"]]()
+def combining_of(kind: str) -> Combining:
+    """Return the way of combining of a kind."""
+    return COMBININGS[kind]()
 
 
-def describe_combined(found: Followed, how: Combining, demos: Sequence[str]) -> dict[str, Any]:
-    """Return the JSON of a combination: its kind, its medoid, and the widths and distances of the combined path.
+def describe_combined(found: Followed, how: Combining, demos: Sequence[str]) -> CombinedFigures:
+    """Return the description of a combination: its kind, its medoid, and the widths and distances of the combined path.
 
     Args:
         found: The combined path.
@@ -97,36 +99,36 @@ def describe_combined(found: Followed, how: Combining, demos: Sequence[str]) -> 
         demos: The digests of the demonstrations, the oldest first.
     """
     combined = found.combined
-    written: dict[str, Any] = as_json(
-        described.Combined(
-            kind=how.kind,
-            medoid=demos[combined.medoid],
-            at=demos[combined.at],
-            moved=combined.moved,
-            apart_mm=tuple(combined.apart_mm.round(6).tolist()),
-            width_mm=tuple(found.width_mm.round(6).tolist()),
-            hysteresis=found.path.hysteresis,
-            bridged_cells=found.path.bridged,
-        )
+    return CombinedFigures(
+        kind=how.kind,
+        medoid=demos[combined.medoid],
+        at=demos[combined.at],
+        moved=combined.moved,
+        apart_mm=tuple(combined.apart_mm.round(6).tolist()),
+        width_mm=tuple(found.width_mm.round(6).tolist()),
+        hysteresis=found.path.hysteresis,
+        bridged_cells=found.path.bridged,
     )
-    return written
 
 
 def learnt_from(version: PolicyVersion) -> Demo:
     """Return the demonstration that a policy was learnt from, or the one that its demonstrations were combined into."""
-    return version.demonstration.demo if "combined" not in version.manifest else _followed(version).demo
+    return version.demonstration.demo if (found := _followed(version)) is None else found.demo
 
 
 def path_of(version: PolicyVersion) -> GridPath:
     """Return the path that a policy was learnt from, computed from its demonstrations and not read from the policy."""
-    return version.demonstration.path if "combined" not in version.manifest else _followed(version).path
+    return version.demonstration.path if (found := _followed(version)) is None else found.path
 
 
 def combined_of(version: PolicyVersion) -> Combined | None:
     """Return the combination of a policy's demonstrations; None for a single one."""
-    return None if "combined" not in version.manifest else _followed(version).combined
+    return None if (found := _followed(version)) is None else found.combined
 
 
-def _followed(version: PolicyVersion) -> Followed:
+def _followed(version: PolicyVersion) -> Followed | None:
+    """Combine the demonstrations of a policy again, which gives the same result; None for a single one."""
+    if (combined := version.manifest.combined) is None:
+        return None
     rows = version.demonstrations
-    return followed([one.demo for one in rows], [one.path for one in rows], combining_of(version.manifest["combined"]))
+    return followed([one.demo for one in rows], [one.path for one in rows], combining_of(combined.kind))

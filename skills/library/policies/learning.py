@@ -1,13 +1,14 @@
 """Learning of one style: from packed demonstrations to a certified policy version that is stored."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
+from skills.arrays import xyz
 from skills.comparison.combining import Combining, followed
 from skills.db.models import (
     SUCCESS,
@@ -29,15 +30,11 @@ from skills.demonstration.demonstration import Demo, partner_motion
 from skills.demonstration.partner import PartnerMotion
 from skills.demonstration.recording import Recording
 from skills.errors import Conflict, NotFound, SkillsError
-from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.gridworld.scene import Surroundings, hazards_of
 from skills.learning.certificate import (
-    Certificate,
     NearLimits,
-    NearOdds,
-    NearStarts,
     OddsLimits,
     certify,
     near_odds,
@@ -45,23 +42,24 @@ from skills.learning.certificate import (
 )
 from skills.learning.dynamic_programming import rule_in
 from skills.learning.evaluation import check_in_space, measure
-from skills.learning.in_scene import SceneCertificate, certify_in_scene, learn_in_scene, scene_learner
+from skills.learning.in_scene import certify_in_scene, learn_in_scene, scene_learner
 from skills.learning.policy import (
     Policy,
     describe_settings,
     learner_of,
 )
 from skills.learning.tube import certified_poses
-from skills.library.operation.integrity import policy_identity_of, poses_identity_of, scene_digest
+from skills.library.operation.integrity import poses_identity_of, scene_digest
 from skills.library.operation.jobs import TrainingRequest
 from skills.library.people.consent import refusal, require
 from skills.library.policies.combined import describe_combined
 from skills.library.policies.gate import driven_or_refused, refusals
 from skills.library.recordings.recordings import Teller, stored_recording
 from skills.packing import canonical, sha256
-from skills.planning.plan import DrivenPass
 from skills.remedies import Action, Remedy
-from skills.schemas.policies import JOINING_FORMAT, Coverage, GridCertificate, Joining
+from skills.schemas import DemoOutcome, Grid
+from skills.schemas.policies import Combined as CombinedFigures
+from skills.schemas.policies import Coverage, GridCertificate, Joining, PolicyManifest, PolicyScene, TrainingFigures
 from skills.settings import Settings
 
 ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
@@ -72,7 +70,7 @@ _VERSIONS, _DEMOS, _SURGEONS = (cast(Table, one.__table__) for one in (PolicyVer
 _OF_STYLE, _USED = _VERSIONS.alias("of_style"), cast(Table, LastUsed.__table__)
 
 
-STANDING = (
+DEMO_STATES = (
     select(
         _DEMOS.c.row,
         _DEMOS.c.withdrawn_at,
@@ -128,11 +126,11 @@ class Lesson:
     suture: str
     demo: bytes
     reward: bytes
-    outcomes: tuple[str | None, ...]
+    outcomes: tuple[DemoOutcome | None, ...]
     recording: str
     partners: tuple[PartnerMotion | None, ...] = (None,)
     others: tuple[int, ...] = ()
-    combined: dict[str, Any] | None = None
+    combined: CombinedFigures | None = None
     shown: tuple[bytes, ...] = ()
     at: int = 0
 
@@ -144,7 +142,7 @@ class Learnt:
     lesson: Lesson
     training: str
     sha256: str
-    manifest: dict[str, Any]
+    manifest: PolicyManifest
     policy: bytes
     coverage: bytes
     poses: Sealed | None
@@ -285,18 +283,66 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
     limits = NearLimits(**request["near"])
     near = near_starts(policy, covered.share, limits)
     chances = None if in_scene is None else near_odds(policy, covered, limits, OddsLimits(**request["odds"]))
-    refused_because = [*refusals(policy, certificate, near, chances), *undriven]
-    manifest = describe_policy(policy, certificate, near, coverage.digest, demo, request, refused_because, driven)
-    if policy.surroundings is not None and in_scene is not None and chances is not None:
-        manifest["scene"] = describe_scene(policy.surroundings, in_scene, chances)
-    if lesson.combined is not None:
-        manifest["combined"] = lesson.combined
-    if request.get("outcomes") == ANY:  # left out otherwise: then none of them is marked recovery or failure
-        manifest["outcomes"] = [*lesson.outcomes]
+    manifest = PolicyManifest(
+        surgeon=request["surgeon"],
+        suture=request["suture"],
+        arm=demo.arm,
+        frame=demo.frame,
+        instrument=demo.instrument,
+        grid=Grid(**asdict(policy.path.grid)),
+        start_mm=xyz(policy.path.tip_mm[0]),
+        goal_mm=xyz(policy.path.tip_mm[-1]),
+        waypoints=policy.path.states.tolist(),
+        phases=policy.domain.phases,
+        learner=policy.learner.kind,
+        learner_version=request["learner_version"],
+        settings=describe_settings(policy.learner),
+        reward_levels=policy.levels,
+        seed=policy.seed,
+        demos=request["demos"],
+        training=TrainingFigures(**vars(policy.training)),
+        metrics=measure(policy.replay, discretisation_rmse(demo.tip_mm, policy.path.grid, policy.path.hysteresis)),
+        coverage=Coverage(
+            starts_reaching_goal=certificate.starts_reaching,
+            starts_joining_nearest=certificate.starts_joining_nearest,
+            n_states=certificate.starts,
+            sha256=coverage.digest,
+            mean_share=certificate.mean_share,
+            median_share=certificate.median_share,
+            starts_goal_alone=certificate.starts_goal_alone,
+        ),
+        grid_certificate=GridCertificate(
+            states_checked=certificate.checked,
+            states_finishing=certificate.finishing,
+            suboptimal_actions=certificate.suboptimal,
+            actions_off_rule=certificate.off_rule,
+            demonstration_reproduced=certificate.demonstration_reproduced,
+            refused_because=(*refusals(policy, certificate, near, chances), *undriven),
+            gate=request["gate"],
+            near=near,
+            driven=driven,
+            note=CERTIFICATE_NOTE,
+        ),
+        combined=lesson.combined,
+        rollouts=check_in_space(policy),
+        # Without a training from any outcome none of them is marked recovery or failure.
+        outcomes=[*lesson.outcomes] if request.get("outcomes") == ANY else None,
+        joining=_joining(policy),
+        ties=policy.ties,
+        scene=None
+        if policy.surroundings is None or in_scene is None or chances is None
+        else PolicyScene(
+            sha256=scene_digest(policy.surroundings.scene),
+            scene=policy.surroundings.scene,
+            costs=policy.surroundings.costs,
+            certificate=in_scene,
+            near=chances,
+        ),
+    )
     return Learnt(
         lesson=lesson,
         training=sha256(canonical(request)),
-        sha256=policy_identity_of(manifest, numbers.digest),
+        sha256=manifest.identity(numbers.digest),
         manifest=manifest,
         policy=numbers.packed,
         coverage=coverage.packed,
@@ -324,13 +370,13 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
     Returns:
         For each, in order, the stored version, or the error for which it was not stored.
     """
-    standing = {one.row: one for one in session.execute(STANDING, {"demonstrations": [o.lesson.row for o in learnt]})}
+    states = {one.row: one for one in session.execute(DEMO_STATES, {"demonstrations": [o.lesson.row for o in learnt]})}
     known = _stored(session.execute(KNOWN, {"digests": [one.sha256 for one in learnt]}))
-    refused = {one.sha256: _refusal(session, one, standing.get(one.lesson.row)) for one in learnt}
+    refused = {one.sha256: _refusal(session, one, states.get(one.lesson.row)) for one in learnt}
     # A version that is already stored is returned as it is, so a retry of a job stores nothing twice.
     new = [one for one in learnt if one.sha256 not in known and refused[one.sha256] is None]
     if new:
-        of_style = [standing[one.lesson.row] for one in new]
+        of_style = [states[one.lesson.row] for one in new]
         values = [_version(one, max(of.last or 0, of.used or 0) + 1) for one, of in zip(new, of_style, strict=True)]
         known |= _stored(session.execute(ADD, values))
         record_events(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
@@ -354,21 +400,21 @@ def _stored(found: Result[Any]) -> dict[str, Stored]:
     return {one.sha256: Stored(one.row, one.version) for one in found}
 
 
-def _refusal(session: Session, learnt: Learnt, standing: Any) -> SkillsError | None:
+def _refusal(session: Session, learnt: Learnt, state: Any) -> SkillsError | None:
     """Return the error that forbids storing.
 
     A demonstration was erased, withdrawn or marked since, or consent has ended.
     """
     others = [session.get(Demonstration, row) for row in learnt.lesson.others]
-    if standing is None or None in others:
+    if state is None or None in others:
         return NotFound(ERASED)
-    if any(one.withdrawn_at is not None for one in (standing, *others)):
+    if any(one.withdrawn_at is not None for one in (state, *others)):
         return Conflict("A demonstration was withdrawn while the training used it.")
-    marked = [one.outcome for one in (standing, *others) if one.outcome not in (None, SUCCESS)]
-    if marked and "outcomes" not in learnt.manifest:
+    marked = [one.outcome for one in (state, *others) if one.outcome not in (None, SUCCESS)]
+    if marked and learnt.manifest.outcomes is None:
         why = f"A demonstration was marked {marked[0]} while the training used it."
         return Conflict(why, Remedy(Action.TRAIN_ANY))
-    return refusal(standing, "training")
+    return refusal(state, "training")
 
 
 def _version(learnt: Learnt, version: int) -> dict[str, Any]:
@@ -381,111 +427,20 @@ def _version(learnt: Learnt, version: int) -> dict[str, Any]:
         "version": version,
         "demonstration_row": learnt.lesson.row,
         "manifest": learnt.manifest,
-        "releasable": not learnt.manifest["grid_certificate"]["refused_because"],
+        "releasable": not learnt.manifest.grid_certificate.refused_because,
         "learnt": learnt.policy,
         "covered": learnt.coverage,
     }
 
 
-def describe_policy(
-    policy: Policy,
-    certificate: Certificate,
-    near: NearStarts,
-    coverage_sha256: str,
-    demo: Demo,
-    request: TrainingRequest,
-    refused_because: list[str],
-    driven: DrivenPass | None,
-) -> dict[str, Any]:
-    """Return the manifest of a policy: the JSON of `schemas.policies.Policy` without version, digest, release, arrays.
-
-    Args:
-        policy: The policy.
-        certificate: The certificate of its grid.
-        near: The starts near the demonstrated one.
-        coverage_sha256: The digest of its coverage.
-        demo: The demonstration that it was learnt from.
-        request: The training's request.
-        refused_because: The reasons against a release; empty if there are none.
-        driven: The demonstrated pass as the arm drives it; None if it could not be solved.
-    """
-    path, grid = policy.path, policy.path.grid
-    wandered = check_in_space(policy)
-    lost_mm = discretisation_rmse(demo.tip_mm, grid, path.hysteresis)
-    metrics = measure(policy.replay, lost_mm)
-    return {
-        "surgeon": request["surgeon"],
-        "suture": request["suture"],
-        "arm": demo.arm,
-        "frame": demo.frame,
-        "instrument": demo.instrument,
-        "grid": describe_grid(policy),
-        "start_mm": path.tip_mm[0].tolist(),
-        "goal_mm": path.tip_mm[-1].tolist(),
-        "waypoints": path.states.tolist(),
-        "phases": policy.domain.phases,
-        "learner": policy.learner.kind,
-        "learner_version": request["learner_version"],
-        "settings": describe_settings(policy.learner),
-        "reward_levels": as_json(policy.levels),
-        "seed": policy.seed,
-        "demos": request["demos"],
-        "training": as_json(policy.training),
-        "metrics": as_json(metrics),
-        "coverage": as_json(
-            Coverage(
-                starts_reaching_goal=certificate.starts_reaching,
-                starts_joining_nearest=certificate.starts_joining_nearest,
-                n_states=certificate.starts,
-                sha256=coverage_sha256,
-                mean_share=certificate.mean_share,
-                median_share=certificate.median_share,
-                starts_goal_alone=certificate.starts_goal_alone,
-            )
-        ),
-        "grid_certificate": as_json(
-            GridCertificate(
-                states_checked=certificate.checked,
-                states_finishing=certificate.finishing,
-                suboptimal_actions=certificate.suboptimal,
-                actions_off_rule=certificate.off_rule,
-                demonstration_reproduced=certificate.demonstration_reproduced,
-                refused_because=tuple(refused_because),
-                gate=request["gate"],
-                near=near,
-                driven=driven,
-                note=CERTIFICATE_NOTE,
-            )
-        ),
-        **({} if wandered is None else {"rollouts": as_json(wandered)}),
-        **joining_of(policy),
-        **({} if policy.ties is None else {"ties": as_json(policy.ties)}),
-    }
-
-
-def describe_scene(surroundings: Surroundings, in_scene: SceneCertificate, near: NearOdds) -> dict[str, Any]:
-    """Return the JSON of the scene that a policy was learnt in, with its odds (`schemas.policies.PolicyScene`)."""
-    return {"sha256": scene_digest(surroundings.scene), **surroundings.as_json()} | {
-        "certificate": as_json(in_scene),
-        "near": as_json(near),
-    }
-
-
-def joining_of(policy: Policy) -> dict[str, Any]:
-    """Return the format and the joining table of a policy; nothing by the rule nearest, which every client knows."""
+def _joining(policy: Policy) -> Joining | None:
+    """Return the joining table of a policy; None by the rule nearest, which every client knows."""
     domain = policy.domain
     if domain.finishes_unjoined:
-        return {}
+        return None
     states = np.flatnonzero(domain.joins)
-    table = Joining(
+    return Joining(
         join_share=domain.join_share,
         states=tuple(states.tolist()),
         phases=tuple(domain.joins[states].tolist()),
     )
-    return {"format": JOINING_FORMAT, "joining": as_json(table)}
-
-
-def describe_grid(policy: Policy) -> dict[str, Any]:
-    """Return the JSON of a policy's grid world."""
-    grid = policy.path.grid
-    return {"origin_mm": list(grid.origin_mm), "cell_mm": grid.cell_mm, "shape": list(grid.shape)}

@@ -1,15 +1,16 @@
-"""Pose styles of policy versions: verified, computed again, and as answers."""
+"""Pose styles of policy versions: verified, computed again, and as answers.
+
+A pose style belongs to its policy version: it is released, withdrawn, covered by consent and erased with it.
+"""
 
 from collections.abc import Sequence
 from typing import Any
 
-from skills.db import rfc3339
 from skills.db.models import PolicyVersion
 from skills.errors import NotFound
-from skills.fields import as_json
 from skills.learning.tube import CertifiedPoses, PoseStep, certified_poses, next_pose
 from skills.library.operation.integrity import posed
-from skills.schemas.pose_styles import NextPose
+from skills.schemas.pose_styles import NextPose, PartnerPath, PoseStyle
 
 FORMAT = "suture-skills pose style 1"
 
@@ -57,65 +58,65 @@ def poses_of_demonstrations(version: PolicyVersion) -> CertifiedPoses | None:
 
     None if a demonstration has no orientation.
     """
-    demos, combined = version.demonstrations, version.manifest.get("combined")
-    at = 0 if combined is None else [one.sha256 for one in demos].index(combined["at"])
+    demos, combined = version.demonstrations, version.manifest.combined
+    at = 0 if combined is None else [one.sha256 for one in demos].index(combined.at)
     return certified_poses([one.demo for one in demos], at)
 
 
-def pose_style_json(version: PolicyVersion, poses: CertifiedPoses) -> dict[str, Any]:
-    """Return the JSON of a pose style (`schemas.policies.PoseStyle`)."""
-    path = poses.path
-    return {
-        "format": FORMAT,
-        "version": version.version,
-        "sha256": version.sha256,
-        "surgeon": version.surgeon.slug,
-        "suture": version.suture,
-        "arm": poses.arm,
-        "frame": poses.frame,
-        "demos": version.manifest["demos"],
-        "position_mm": path.tip_mm.tolist(),
-        "rotation_xyzw": path.rotation_xyzw.tolist(),
-        "jaw_rad": None if path.jaw_rad is None else path.jaw_rad.tolist(),
-        "elapsed_s": path.elapsed_s.tolist(),
-        "spread_mm": path.spread_mm.tolist(),
-        "spread_rad": path.spread_rad.tolist(),
-        "turn_share": path.turn_share,
-        "tick_s": poses.tick_s,
-        "tube": as_json(poses.tube),
-        "scene": None if poses.scene is None else as_json(poses.scene),
-        "partner": None if poses.partner is None else as_json(poses.partner),
-        **_beside(poses),
-        "created_at": rfc3339(version.created_at),
-    }
+def describe_pose_style(version: PolicyVersion, poses: CertifiedPoses) -> PoseStyle:
+    """Return a pose style as it is served."""
+    path, other = poses.path, poses.path.partner
+    partner_motion = None
+    if other is not None:
+        partner_motion = PartnerPath.model_construct(
+            arm=other.arm,
+            position_mm=other.tip_mm.tolist(),
+            rotation_xyzw=other.rotation_xyzw.tolist(),
+            jaw_rad=None if other.jaw_rad is None else other.jaw_rad.tolist(),
+            scene=poses.partner_scene,
+        )
+    return PoseStyle.model_construct(
+        format=FORMAT,
+        version=version.version,
+        sha256=version.sha256,
+        surgeon=version.surgeon.slug,
+        suture=version.suture,
+        arm=poses.arm,
+        frame=poses.frame,
+        demos=version.manifest.demos,
+        position_mm=path.tip_mm.tolist(),
+        rotation_xyzw=path.rotation_xyzw.tolist(),
+        jaw_rad=None if path.jaw_rad is None else path.jaw_rad.tolist(),
+        elapsed_s=path.elapsed_s.tolist(),
+        spread_mm=path.spread_mm.tolist(),
+        spread_rad=path.spread_rad.tolist(),
+        turn_share=path.turn_share,
+        tick_s=poses.tick_s,
+        tube=poses.tube,
+        scene=poses.scene,
+        partner=poses.partner,
+        partner_motion=partner_motion,
+        created_at=version.created_at,
+    )
 
 
-def _beside(poses: CertifiedPoses) -> dict[str, Any]:
-    """Return the field of the other arm's motion; none where there is none, as it was before there were any."""
-    other, near = poses.path.partner, poses.partner_scene
-    if other is None:
-        return {}
-    jaw_rad = None if other.jaw_rad is None else other.jaw_rad.tolist()
-    moved = {"arm": other.arm, "position_mm": other.tip_mm.tolist(), "rotation_xyzw": other.rotation_xyzw.tolist()}
-    return {"partner_motion": {**moved, "jaw_rad": jaw_rad, "scene": None if near is None else as_json(near)}}
+def describe_step(poses: CertifiedPoses, step: PoseStep) -> dict[str, Any]:
+    """Return the fields of a step (`skills.schemas.pose_styles.PoseAnswer`), for messages of sessions without a model.
+
+    A session answers a thousand times a second, for which a model is too slow.
+    """
+    other, partner_pose = poses.path.partner, None
+    if other is not None:
+        partner_pose = {
+            "arm": other.arm,
+            "position_mm": other.tip_mm[step.phase].tolist(),
+            "rotation_xyzw": other.rotation_xyzw[step.phase].tolist(),
+            "jaw_rad": None if other.jaw_rad is None else float(other.jaw_rad[step.phase]),
+        }
+    return {**vars(step), "inside": poses.tube.contains(step.off_mm, step.off_rad), "partner_pose": partner_pose}
 
 
-def next_json(poses: CertifiedPoses, step: PoseStep) -> dict[str, Any]:
-    """Return the JSON of a step (`schemas.policies.PoseAnswer`)."""
-    inside = poses.tube.contains(step.off_mm, step.off_rad)
-    return {**vars(step), "inside": inside, "partner_pose": _partner_pose(poses, step.phase)}
-
-
-def _partner_pose(poses: CertifiedPoses, phase: int) -> dict[str, Any] | None:
-    """Return the JSON of the other arm's pose at a phase (`schemas.policies.PartnerPose`); None if it has none."""
-    other = poses.path.partner
-    if other is None:
-        return None
-    pose = {"position_mm": other.tip_mm[phase].tolist(), "rotation_xyzw": other.rotation_xyzw[phase].tolist()}
-    return {"arm": other.arm, **pose, "jaw_rad": None if other.jaw_rad is None else float(other.jaw_rad[phase])}
-
-
-def about_next(
+def find_next(
     version: PolicyVersion,
     poses: CertifiedPoses,
     position_mm: Sequence[float],
@@ -124,5 +125,10 @@ def about_next(
 ) -> NextPose:
     """Return the next pose of a version for a pose and its phase; see `skills.learning.tube.next_pose`."""
     step = next_pose(poses.path, position_mm, rotation_xyzw, phase, poses.tube.limits)
-    named = {"version": version.version, "sha256": version.sha256, "frame": poses.frame, "tick_s": poses.tick_s}
-    return NextPose.model_validate(named | next_json(poses, step))
+    return NextPose(
+        version=version.version,
+        sha256=version.sha256,
+        frame=poses.frame,
+        tick_s=poses.tick_s,
+        **describe_step(poses, step),
+    )

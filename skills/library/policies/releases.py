@@ -19,9 +19,10 @@ job.
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from itertools import groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import (
+    JSON,
     ColumnElement,
     ScalarSelect,
     String,
@@ -50,8 +51,10 @@ from skills.errors import Conflict, NotFound
 from skills.library.operation.history import refuse_edited
 from skills.library.operation.integrity import learnt
 from skills.library.people import consent
-from skills.library.policies.fit import fit_of_versions, not_worse, shown_mm
+from skills.library.policies.fit import compare_versions, format_mm, not_worse
+from skills.library.policies.gate import join_reasons, remedy
 from skills.planning.plan import CONSTANT_TURN_DEG, departure_of
+from skills.schemas.policies import GateRefusal
 
 
 def _newest_leaf(table: type[Release | Surgeon]) -> ScalarSelect[Any]:
@@ -62,7 +65,7 @@ def _newest_leaf(table: type[Release | Surgeon]) -> ScalarSelect[Any]:
 # The newest release of a style that is not withdrawn, with columns that identify it for ever: row numbers are reused
 # after an erasure. It is served if the surgeon's consent, returned as text, covers training. A pose style may be added
 # to its version later. The newest leaves show that the service changed a row, although somebody changed it back.
-STANDS = (
+NEWEST_RELEASE = (
     select(
         Release.row,
         type_coerce(Release.released_at, String).label("released_at"),
@@ -82,7 +85,7 @@ STANDS = (
 )
 
 
-def standing(session: Session, surgeon_row: int, suture: str) -> Sequence[Release]:
+def in_force(session: Session, surgeon_row: int, suture: str) -> Sequence[Release]:
     """List a style's releases that are not withdrawn, the newest first.
 
     That one is served, if consent covers training.
@@ -96,7 +99,7 @@ def standing(session: Session, surgeon_row: int, suture: str) -> Sequence[Releas
 
 def served(session: Session, surgeon: Surgeon, suture: str) -> Release | None:
     """Return the release that a style serves today; None if there is none or consent does not cover training."""
-    releases = standing(session, surgeon.row, suture)
+    releases = in_force(session, surgeon.row, suture)
     return releases[0] if releases and consent.may(surgeon, "training") else None
 
 
@@ -121,7 +124,7 @@ def serves(session: Session, policy: PolicyVersion) -> bool:
 
 def shares_served(session: Session, suture: str) -> dict[str, float]:
     """Return the mean share of the demonstration that the starts of each served policy follow, by surgeon."""
-    share = PolicyVersion.manifest["coverage", "mean_share"]
+    share = type_coerce(PolicyVersion.manifest, JSON)["coverage", "mean_share"]
     query = select(Surgeon.slug, share).select_from(Release).join(Surgeon, Surgeon.row == Release.surgeon_row)
     query = query.join(PolicyVersion, PolicyVersion.row == Release.policy_row)
     found = session.execute(query.where(Release.suture == suture, is_served()))
@@ -159,45 +162,86 @@ def release(
         Corrupt: The stored policy does not match its digest.
     """
     consent.require(policy.surgeon, "training")
+    released, reasons = _release(session, policy, actor, constant_turn_deg)
+    if released is None:
+        raise _not_releasable(policy, reasons)
+    return released
+
+
+def _not_releasable(policy: PolicyVersion, reasons: Sequence[GateRefusal]) -> Conflict:
+    text = f"Version {policy.version} cannot be released: {join_reasons(reasons)}."
+    return Conflict(text, reasons=[one.text for one in reasons])
+
+
+def _release(
+    session: Session, policy: PolicyVersion, actor: str, constant_turn_deg: float
+) -> tuple[Release | None, list[GateRefusal]]:
+    """Release a version that consent covers; return its release, or None and the reasons against it."""
     learnt(policy)
-    served = standing(session, policy.surgeon_row, policy.suture)
+    served = in_force(session, policy.surgeon_row, policy.suture)
     if served and served[0].policy_row == policy.row:
-        return served[0]
-    reasons = list(policy.manifest["grid_certificate"]["refused_because"])
-    reasons += [f"its demonstration {what}" for what in policy.objections]
+        return served[0], []
+    reasons = [*policy.manifest.grid_certificate.refused_because, *changed_demonstrations(policy)]
     reasons += _held(policy, constant_turn_deg)
     # Only phased policies have to reproduce their demonstration; one of the cell state must at least not be worse.
-    if policy.manifest["phases"] == 1 and served:
-        found = fit_of_versions(session, served[0].policy, policy)
-        if not not_worse(found):
-            trained, before = shown_mm(found.trained_mm), shown_mm(found.released_mm)
-            reasons.append(
+    if policy.manifest.phases == 1 and served:
+        fit = compare_versions(session, served[0].policy, policy)
+        if not not_worse(fit):
+            text = (
                 "it follows the demonstrations worse than the released one "
-                f"({trained} against {before} mm on the same {len(found.demos)})"
+                f"({format_mm(fit.trained_mm)} against {format_mm(fit.released_mm)} mm on the same {len(fit.demos)})"
             )
+            reasons.append(GateRefusal("worse", text))
     if reasons or not policy.releasable:
-        raise Conflict(f"Version {policy.version} cannot be released: {'; '.join(reasons)}.", reasons=reasons)
+        return None, reasons
     released = Release(policy=policy, surgeon_row=policy.surgeon_row, suture=policy.suture, released_by=actor)
     session.add(released)
     record_event(session, actor, "release", "policy-version", policy.sha256, policy.surgeon)
     session.flush()
     announce(session)
-    return released
+    return released, []
 
 
-def _held(policy: PolicyVersion, constant_turn_deg: float) -> list[str]:
+class Released(NamedTuple):
+    """The effect of a request for a release: whether it was made, else the reason and the remedy."""
+
+    released: bool
+    not_released_because: str | None
+    remedy: str | None
+
+
+NOT_REQUESTED = Released(False, None, None)
+
+
+def try_release(session: Session, policy: PolicyVersion, actor: str) -> Released:
+    """Release a policy version if it passes the gate, as `release` does; return why it was not released."""
+    if (without := consent.refusal(policy.surgeon, "training")) is not None:
+        return Released(False, without.words(), remedy([GateRefusal("consent", without.message)]))
+    released, reasons = _release(session, policy, actor, CONSTANT_TURN_DEG)
+    if released is None:
+        return Released(False, _not_releasable(policy, reasons).words(), remedy(reasons))
+    return Released(True, None, None)
+
+
+def changed_demonstrations(policy: PolicyVersion) -> list[GateRefusal]:
+    """Return the reasons against a release of a version whose demonstration was withdrawn or marked since."""
+    return [GateRefusal(change.kind, f"its demonstration {change.text}") for change in policy.objections]
+
+
+def _held(policy: PolicyVersion, constant_turn_deg: float) -> list[GateRefusal]:
     """Return the reason against a version whose joint limits were checked with the jaw held, though it was turned."""
-    driven = policy.manifest["grid_certificate"]["driven"]
-    if driven is None or driven["orientation"] == "recorded":
+    driven = policy.manifest.grid_certificate.driven
+    if driven is None or driven.orientation == "recorded":
         return []
     found = [departure_of(one.demo) for one in policy.demonstrations]
     turn_deg = max((one.deg for one in found if one is not None), default=0.0)
     if turn_deg <= constant_turn_deg:
         return []
-    return [
+    text = (
         f"its joint limits were checked with the jaw held, but its demonstration turns by {turn_deg:.1f} degrees, over "
         f"{constant_turn_deg:g}, and a plan turns too; train it again"
-    ]
+    )
+    return [GateRefusal("jaw held", text)]
 
 
 def withdraw(session: Session, surgeon: Surgeon, suture: str, actor: str) -> list[Release]:
@@ -206,7 +250,7 @@ def withdraw(session: Session, surgeon: Surgeon, suture: str, actor: str) -> lis
     Raises:
         NotFound: Nothing of the style is released.
     """
-    releases = list(standing(session, surgeon.row, suture))
+    releases = list(in_force(session, surgeon.row, suture))
     if not releases:
         raise NotFound(f"No policy of '{surgeon.slug}' and '{suture}' is released.")
     _withdraw(session, releases, actor)
@@ -223,7 +267,7 @@ def withdraw_all(session: Session, surgeon: Surgeon, actor: str) -> list[Release
 
 def withdraw_resting_on(session: Session, demonstration: Demonstration, actor: str) -> list[Release]:
     """Withdraw the releases learnt from a demonstration; if the served one is among them, all of the style."""
-    releases = standing(session, demonstration.surgeon_row, demonstration.suture)
+    releases = in_force(session, demonstration.surgeon_row, demonstration.suture)
     withdrawn = _with_superseded(releases, [r for r in releases if demonstration in r.policy.demonstrations])
     _withdraw(session, withdrawn, actor)
     return withdrawn
@@ -234,7 +278,7 @@ def withdraw_failed(session: Session, demonstration: Demonstration, actor: str) 
 
     Those of versions that were trained from any outcome stay, unless they were superseded by one that is withdrawn.
     """
-    releases = standing(session, demonstration.surgeon_row, demonstration.suture)
+    releases = in_force(session, demonstration.surgeon_row, demonstration.suture)
     resting = [one for one in releases if demonstration in one.policy.demonstrations]
     failed = [one for one in resting if not one.policy.of_any_outcome]
     _withdraw(session, _with_superseded(releases, failed), actor)

@@ -21,7 +21,7 @@ from skills.db.models import (
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.deep import require_installed
-from skills.errors import BadInput, Conflict
+from skills.errors import BadInput
 from skills.gridworld.reward import RewardLevels
 from skills.gridworld.scene import refuse_unfit
 from skills.learning.certificate import (
@@ -49,7 +49,7 @@ from skills.library.policies.learning import ANY, combined_lesson, learn_style, 
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import find_demo
 from skills.library.recordings.recordings import confined_reader
-from skills.schemas.training import TrainingIn
+from skills.schemas.training import TrainingIn, TrainingResult
 from skills.settings import Settings
 
 POSES_VERSION = 1  # part of a training's identity: raise it when equal demonstrations give another pose style
@@ -174,23 +174,16 @@ def _refuse_depth_along(depth_along: Sequence[float], learner: Learner, frame: s
 def _release_again(session: Session, job: Job, actor: str) -> str:
     """Release the version of a finished training unless its style serves it already; return the effect in words."""
     assert job.result is not None, "it has succeeded"
-    version = find_by_digest(session, job.result["sha256"])
+    result = TrainingResult.model_validate(job.result)
+    version = find_by_digest(session, result.sha256)
     served = releases.served(session, version.surgeon, version.suture)
     if served is not None and served.policy_row == version.row:
         return f"Nothing: the style serves version {version.version} already."
-    because = _release(session, version, actor)
-    job.result = job.result | {"released": because is None, "not_released_because": because}
+    released = releases.try_release(session, version, actor)
+    job.result = result.model_copy(update=released._asdict()).model_dump()
     session.flush()
+    because = released.not_released_because
     return f"Version {version.version} was released." if because is None else f"Nothing: {because}"
-
-
-def _release(session: Session, version: PolicyVersion, actor: str) -> str | None:
-    """Release a version; return None, or the reason why it was refused."""
-    try:
-        releases.release(session, version, actor)
-    except Conflict as refused:
-        return refused.words()
-    return None
 
 
 def train_style(database: Database, request: TrainingRequest, settings: Settings) -> Store:
@@ -200,18 +193,18 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if a recording is not cached
         found = with_partners(database, found, reader.tell)
-    lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
+    lesson = combined_lesson(found, combining_of(request["combine"]["kind"])) if "combine" in request else found[0]
     learnt = learn_style(lesson, request, settings, jobs.telling(database, "training", request))
 
     def store(session: Session, actor: str) -> dict[str, Any]:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)
-        because = _release(session, version, actor) if request["release"] else None
-        return {
-            "policy_version": version.version,
-            "sha256": version.sha256,
-            "releasable": version.releasable,
-            "released": request["release"] and because is None,
-            "not_released_because": because,
-        }
+        wanted = request["release"]
+        released = releases.try_release(session, version, actor) if wanted else releases.NOT_REQUESTED
+        return TrainingResult(
+            policy_version=version.version,
+            sha256=version.sha256,
+            releasable=version.releasable,
+            **released._asdict(),
+        ).model_dump()
 
     return store

@@ -1,14 +1,4 @@
-"""Policies of a style: the served version, history, rollouts, arrays for a client, demonstrations and pose style.
-
-A policy may be learnt from several demonstrations. A combined path that is none of the demonstrations is stored only as
-the policy's path. To get more of it, combine the demonstrations again, which gives the same result; `skills verify`
-compares the resulting path with the policy's.
-
-A pose style belongs to its policy version: it is released, withdrawn, covered by consent and erased with it.
-
-    PolicyVersion --poses_of--> CertifiedPoses, verified, if its tube's certificate holds
-    PolicyVersion --poses_of_demonstrations--> the same, computed again from what is stored
-"""
+"""Policy versions of a style: the served one, the history, and finding one."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass

@@ -10,6 +10,7 @@ from skills.db.models import StoredPictures, StoredPlayback
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.errors import NotDrawnYet
+from skills.fields import as_json
 from skills.library.operation import jobs
 from skills.library.operation.jobs import PICTURES, PicturesRequest
 from skills.remedies import Action, Remedy
@@ -30,7 +31,7 @@ def draw_pictures(
 
     with database.reading() as session:
         playback = _playback(session, request)
-        measured, report = playback.measured, playback.report
+        measured, report = playback.measured, as_json(playback.report)
     trajectory = measured.trajectory
     shot = film.shoot(trajectory, pad_top_mm=float(measured.pad_mm[2]), memory_bytes=settings.playback_memory_bytes)
     drawn = Pictures(
