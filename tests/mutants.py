@@ -356,7 +356,7 @@ GUARDS = (
          "tests/library/test_joining.py", "tests/library/test_scenes.py", "tests/library/test_release_gate.py"),
     ),
     Guard(
-        "skills/library/policies/training.py", 6,
+        "skills/library/policies/learning.py", 6,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_library.py",
          "tests/library/test_outcomes.py"),
         ("_refusal", "_version"),
@@ -376,7 +376,14 @@ GUARDS = (
     ),
     Guard("skills/db/saved_heads.py", 8, ("tests/api/test_rollback.py", "tests/library/test_history.py")),
     Guard(
-        "skills/library/policies/releases.py", 33,
+        "skills/library/policies/gate.py", 14,
+        ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_scenes.py",
+         "tests/api/test_policies.py::test_a_demo_in_a_frame_other_than_the_arms_base_is_not_released",
+         "tests/library/test_hands.py"),
+    ),
+    Guard("skills/library/policies/fit.py", 4, ("tests/library/test_fair_batches.py",)),
+    Guard(
+        "skills/library/policies/releases.py", 18,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_scenes.py",
          "tests/api/test_policies.py::test_a_demo_in_a_frame_other_than_the_arms_base_is_not_released",
          "tests/api/test_policies.py::test_after_a_withdrawal_nothing_older_comes_back_by_itself",
@@ -394,7 +401,7 @@ GUARDS = (
         ("tests/api/test_policy_cache.py", *(f"tests/api/test_served.py::test_{name}" for name in (
             "erased_policies_leave_all_processes_memory_without_a_request",
             "the_short_way_and_the_long_one_give_the_same_answers",
-            "a_cached_policy_is_not_given_to_whoever_may_not_see_it",
+            "a_policy_cached_is_not_given_to_whoever_may_not_see_it",
             "a_policy_learnt_again_after_an_erasure_gets_its_own_dates",
         ))),
     ),

@@ -18,7 +18,7 @@ import pytest
 from typer.main import get_command
 
 import skills
-from skills.api.routes import comparison, operating, pages, plans, recordings, sign_in
+from skills.api.routes import comparison, operating, pages, recordings, sign_in, timelines
 from skills.cli import app
 from tests.api.conformance import conformance
 
@@ -39,7 +39,7 @@ UNDESCRIBED = (
     pages.router,
     recordings.page_router,
     comparison.page_router,
-    plans.timeline_page_router,
+    timelines.page_router,
     sign_in.sign_in_router,
     operating.reference_router,
 )

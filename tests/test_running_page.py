@@ -1,7 +1,6 @@
 """The runner of docs/running.md against the service's own `next_step`, on real and synthetic policies."""
 
 import io
-import json
 import re
 from collections.abc import Callable
 from functools import cache
@@ -10,10 +9,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import orjson
 import pytest
 from numpy.typing import NDArray
 
+from skills.api.responses import json_of
 from skills.arrays import xyz
 from skills.formats import read_recording
 from skills.gridworld.grid import GridWorld, discretize
@@ -21,8 +20,7 @@ from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import coverage
 from skills.learning.policy import Learner, Policy, learn_tabular, next_step
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.library.policies import versions
-from skills.library.policies.training import joining_of
+from skills.library.policies import answers, learning
 from skills.schemas import policy_document
 from tests.by_day import some
 from tests.formats.bags import sample_folder
@@ -53,22 +51,21 @@ def recorded(cell_mm: float, learner: Learner) -> Policy:
 
 def as_npz(policy: Policy) -> io.BytesIO:
     """Return the service's arrays of a policy."""
-    version: Any = SimpleNamespace(sha256="00" * 32, manifest=joining_of(policy))
-    return io.BytesIO(versions.arrays_of(version))
+    version: Any = SimpleNamespace(sha256="00" * 32, manifest=SimpleNamespace(joining=learning._joining(policy)))
+    return io.BytesIO(answers.arrays_of(version))
 
 
 def as_json(policy: Policy) -> io.StringIO:
     """Return the part of the service's JSON from which a policy runs."""
-    grid, rule = policy.path.grid, joining_of(policy)
-    about = rule | {
+    grid = policy.path.grid
+    about = {
+        "joining": learning._joining(policy),
         "grid": {"origin_mm": grid.origin_mm, "cell_mm": grid.cell_mm, "shape": grid.shape},
         "waypoints": policy.path.states.tolist(),
-        policy_document.table_name(rule, "actions"): policy_document.actions_of(policy),
+        "actions": policy_document.actions_of(policy),
+        "live_actions": policy_document.live_actions_of(policy),
     }
-    live = policy_document.live_actions_of(policy)
-    return io.StringIO(
-        json.dumps(about | ({} if live is None else {policy_document.table_name(rule, "live_actions"): live}))
-    )
+    return io.StringIO(json_of(about).decode())
 
 
 def agrees(runner: Any, policy: Policy, states: NDArray[np.int64]) -> None:
@@ -93,8 +90,8 @@ def loaded(monkeypatch: pytest.MonkeyPatch) -> Callable[[Policy, str], Any]:
     """Return a function that writes a policy as the service does, and reads it as the page does."""
 
     def load(policy: Policy, form: str) -> Any:
-        monkeypatch.setattr(versions, "learnt", lambda _: policy)
-        monkeypatch.setattr(versions, "covered", lambda _: coverage(policy))
+        monkeypatch.setattr(answers, "learnt", lambda _: policy)
+        monkeypatch.setattr(answers, "covered", lambda _: coverage(policy))
         if form == "live":
             monkeypatch.setattr(policy_document, "MAX_JSON_ACTIONS", 0)
         written = as_npz(policy) if form == "npz" else as_json(policy)
@@ -141,18 +138,10 @@ def test_the_json_of_a_large_policy_has_its_live_actions_alone(loaded):
     assert policy_document.actions_of(policy) is None
     live = policy_document.live_actions_of(policy)
     assert live is not None
-    assert sum(len(box["actions"]) for box in live) == domain.n_rows == 64_258
-    assert len(orjson.dumps(live)) == pytest.approx(0.18e6, rel=0.03)
+    assert sum(len(box.actions) for box in live) == domain.n_rows == 64_258
+    assert len(json_of(live)) == pytest.approx(0.18e6, rel=0.03)
     rows = np.random.default_rng(0).choice(np.flatnonzero(domain.certified), 200)
     agrees(loaded(policy, "json"), policy, np.unique(domain.state_of[rows])[:20])
-
-
-def test_the_runner_stops_at_a_format_that_it_does_not_know(loaded):
-    about = json.loads(as_json(learnt(next(iter(WALKS)), join_share=0.5)).read())
-    with pytest.raises(KeyError):
-        names()["from_json"](io.StringIO(json.dumps(about | {"format": 3})))
-    with pytest.raises(KeyError, match="actions"):
-        names()["from_json"](io.StringIO(json.dumps({**about, "format": 1})))
 
 
 def test_the_runner_is_as_long_as_the_page_says():

@@ -3,14 +3,14 @@
 from functools import partial
 from typing import Annotated
 
-from fastapi import Depends, Path, Query, Request
+from fastapi import Depends, Header, Path, Query, Request
 
 from skills.api.authorisation import Asking
 from skills.db.session import Database
 from skills.jobs import Engine
 from skills.library.operation.jobs import refuse_too_many
 from skills.library.recordings.recordings import Parser, Reader
-from skills.schemas.requests import DIGEST, SLUG
+from skills.schemas.requests import DIGEST, JOB, SLUG
 from skills.settings import Settings
 
 
@@ -55,6 +55,9 @@ Actor = Annotated[str, Depends(_actor)]
 Slug = Annotated[str, Path(pattern=SLUG)]
 Digest = Annotated[str, Path(pattern=DIGEST)]
 Limit = Annotated[int, Query(ge=1, le=200)]
+JobId = Annotated[str, Path(pattern=JOB)]
+Version = Annotated[int, Path(ge=1, le=2**31)]
+Accept = Annotated[str, Header(max_length=500)]
 RowCursor = Annotated[int | None, Query(alias="cursor", ge=1, le=2**62)]
 SlugCursor = Annotated[str | None, Query(alias="cursor", pattern=SLUG)]
 

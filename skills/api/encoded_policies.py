@@ -4,16 +4,15 @@ import re
 from collections.abc import Collection
 from functools import lru_cache
 
-import orjson
-
-from skills.api.responses import JSON, Body, tag_of
+from skills.api.responses import JSON, Body, json_of, tag_of
 from skills.db.history import History
 from skills.db.models import PolicyVersion, Release
 from skills.db.weighted_cache import WeightedCache
 from skills.errors import UnknownFormat
 from skills.library.operation.proofs import sign_files
-from skills.library.policies import versions
-from skills.library.policies.versions import Served, has_poses, pose_style_json, poses_of
+from skills.library.policies import answers
+from skills.library.policies.pose_styles import describe_pose_style, has_poses, poses_of
+from skills.library.policies.versions import Served
 from skills.settings import MEBIBYTE
 from skills.transparency.notes import Note
 
@@ -66,7 +65,7 @@ class Encoded:
         key = (policy.sha256, policy.version, policy.created_at, policy.poses.sha256 if policy.poses else None)
         body = self._kept.get(key)
         if body is None:
-            content = orjson.dumps(pose_style_json(policy, poses_of(policy)))
+            content = json_of(describe_pose_style(policy, poses_of(policy)))
             body = Body(content, JSON, tag_of(content))
             self._kept.put(key, body)
         return body
@@ -103,11 +102,11 @@ class Encoded:
 
 def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> Body:
     if media_type == NPZ:
-        content = versions.arrays_of(policy)
+        content = answers.arrays_of(policy)
     else:
         arrays = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
-        content = orjson.dumps(versions.policy_json(policy, release) | {"arrays": arrays})
-    # A header and no field: the bytes, and so the ETag and what older clients verify, stay those of the policy.
+        content = json_of(answers.describe_policy(policy, release, arrays))
+    # A header and no field, so that the bytes and the ETag stay those of the policy.
     linked = release is not None and policy.poses is not None
     link = f'<{policy.suture}/pose-style>; rel="related"; title="pose style"' if linked else None
     return Body(content, media_type, tag_of(content), link)

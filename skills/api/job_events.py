@@ -17,7 +17,8 @@ from skills.api.responses import json_of
 from skills.db.changes import Changes
 from skills.db.session import Database
 from skills.errors import SkillsError, TooMany
-from skills.library.operation.jobs import ACTIVE, describe_job, describe_jobs, find_job, find_jobs
+from skills.library.operation.jobs import ACTIVE, find_job, find_jobs
+from skills.library.policies.outcomes import describe_job, describe_jobs
 from skills.schemas.operation import Job
 from skills.settings import Settings
 

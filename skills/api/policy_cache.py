@@ -30,7 +30,7 @@ from skills.library.operation.history import is_last_signed, sign_history
 from skills.library.operation.proofs import first_head
 from skills.library.people import consent
 from skills.library.policies import versions
-from skills.library.policies.releases import STANDS
+from skills.library.policies.releases import NEWEST_RELEASE
 
 Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response, or `POSES`, or `SIGNATURE`
 
@@ -49,7 +49,7 @@ class Known:
     """A cached response: a style's policy, its release, and the database version at which both were valid."""
 
     body: Body
-    release: tuple[Any, ...]  # the row of the query `STANDS`; its last column is the policy's digest
+    release: tuple[Any, ...]  # the row of the query `NEWEST_RELEASE`; its last column is the policy's digest
     last_day: date | None  # of the surgeon's consent
     version: int | None
 
@@ -89,7 +89,7 @@ class PolicyCache:
             return None
         if known.version != version:
             try:
-                if self.changes.first(STANDS, {"surgeon": surgeon, "suture": suture}) != known.release:
+                if self.changes.first(NEWEST_RELEASE, {"surgeon": surgeon, "suture": suture}) != known.release:
                     return None
             except Unasked:
                 return None
@@ -135,7 +135,7 @@ class PolicyCache:
         saved = self._database.history.saved_head()
         with self._database.reading() as session:
             self._database.history.compare(session.connection(), saved)
-            release = session.execute(STANDS, {"surgeon": surgeon, "suture": suture}).first()
+            release = session.execute(NEWEST_RELEASE, {"surgeon": surgeon, "suture": suture}).first()
             known = self._known.get(key)
             if known is not None and release is not None and known.release == tuple(release) and not known.over:
                 return Known(known.body, known.release, known.last_day, None)

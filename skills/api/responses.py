@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from skills.db.service_tables import Job
 from skills.errors import PreconditionFailed
 from skills.formats import BYTES
-from skills.library.operation.jobs import describe_job
+from skills.library.policies.outcomes import describe_job
 
 JSON = "application/json"
 Condition = Annotated[str | None, Header(max_length=2000)]
@@ -36,7 +36,7 @@ def json_of(said: Any, *, indented: bool = False) -> bytes:
 
 def _fields(said: Any) -> dict[str, Any]:
     if isinstance(said, BaseModel):
-        return said.model_dump()
+        return said.model_dump(mode="json", warnings=False)  # lists of arrays stand in place of tuples
     raise TypeError(f"{type(said)} is no JSON")
 
 

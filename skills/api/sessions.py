@@ -46,7 +46,8 @@ from skills.learning.pose_step import next_pose
 from skills.learning.tube import CertifiedPoses
 from skills.library.people import consent
 from skills.library.policies import releases
-from skills.library.policies.versions import next_json, policy_of, poses_of
+from skills.library.policies.pose_styles import describe_step, poses_of
+from skills.library.policies.versions import policy_of
 from skills.schemas.pose_styles import PoseIn
 from skills.settings import Settings
 
@@ -150,7 +151,7 @@ class Follower:
         except SkillsError as wrong:
             return orjson.dumps({"error": wrong.words()})
         self.phase = step.phase
-        return orjson.dumps(next_json(poses, step) | {"newer_version": self.newer_version})
+        return orjson.dumps(describe_step(poses, step) | {"newer_version": self.newer_version})
 
 
 class Sessions:

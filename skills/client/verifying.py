@@ -5,7 +5,6 @@ Whoever changed a number, in transit or in the store, would have to change the d
 """
 
 import io
-import json
 
 import numpy as np
 
@@ -18,15 +17,8 @@ from skills.learning.policy import Policy as LearntPolicy
 from skills.learning.policy import learner_of
 from skills.learning.q_learning import Training
 from skills.schemas.demos import Demonstration
-from skills.schemas.policies import Policy
-from skills.schemas.policy_document import live_actions_of, policy_identity
-
-FORMATS = (1, 2)  # of a policy, that this client can follow
-# Fields of a version or of its response, which the digest of a policy does not cover.
-OF_THE_VERSION = (
-    *("version", "sha256", "created_at", "released_at", "released_by", "arrays"),
-    *("actions", "actions_joining", "live_actions", "live_actions_joining"),
-)
+from skills.schemas.policies import Policy, PolicyManifest
+from skills.schemas.policy_document import digest_of_numbers, live_actions_of
 
 
 def rebuild_policy(document: bytes, arrays: bytes, demo: bytes) -> LearntPolicy:
@@ -47,17 +39,12 @@ def rebuild_policy(document: bytes, arrays: bytes, demo: bytes) -> LearntPolicy:
 
 def _is_intact(document: bytes, policy: LearntPolicy) -> bool:
     """Return whether a policy and its JSON match the digest in it, and the actions there those of the policy."""
-    sent = json.loads(document)
-    said = Policy.model_validate(sent)
-    manifest = {name: value for name, value in sent.items() if name not in OF_THE_VERSION}
-    actions, live = said.actions, said.live_actions
-    if said.joining is not None:
-        actions, live = said.actions_joining, said.live_actions_joining
+    said = Policy.model_validate_json(document)
+    live = None if said.live_actions is None else [*said.live_actions]
     return (
-        said.format in FORMATS
-        and policy_identity(manifest, policy) == said.sha256
-        and (actions is None or actions == policy.table().tolist())
-        and (None if live is None else [one.model_dump() for one in live]) == live_actions_of(policy)
+        PolicyManifest.model_validate_json(document).identity(digest_of_numbers(policy)) == said.sha256
+        and (said.actions is None or said.actions == policy.table().tolist())
+        and live == live_actions_of(policy)
     )
 
 

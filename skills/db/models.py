@@ -47,9 +47,13 @@ from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
 from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.planning.trajectory import Trajectory
+from skills.schemas import DemoOutcome
 from skills.schemas.calibrations import Calibration
 from skills.schemas.demos import ChosenSegment, DemoReport
 from skills.schemas.people import Consent
+from skills.schemas.plans import PlanDescription
+from skills.schemas.playbacks import Verdict
+from skills.schemas.policies import GateRefusal, PolicyManifest
 from skills.schemas.policy_document import POLICY_CLASSES
 from skills.schemas.recordings import RecordingContent, TableIn
 from skills.verification.playback import Pictures, Playback
@@ -284,7 +288,7 @@ class Demonstration(Base):
     segment: Mapped[ChosenSegment] = mapped_column(AsJson(ChosenSegment))
     created_at: Mapped[datetime] = mapped_column(default=now)
     withdrawn_at: Mapped[datetime | None]
-    outcome: Mapped[str | None] = column_property(newest_mark("outcome", row))
+    outcome: Mapped[DemoOutcome | None] = column_property(newest_mark("outcome", row))
     outcome_reason: Mapped[str | None] = column_property(newest_mark("reason", row))
 
     recording: Mapped[StoredRecording] = relationship(lazy="joined", innerjoin=True)
@@ -353,7 +357,7 @@ class PolicyVersion(Numbered):
     suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
     version: Mapped[int]
     demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), index=True)
-    manifest: Mapped[dict[str, Any]]
+    manifest: Mapped[PolicyManifest] = mapped_column(AsJson(PolicyManifest))
     releasable: Mapped[bool]
     learnt: Mapped[Policy] = mapped_column(Packed(Policy), deferred=True)
     covered: Mapped[Coverage] = mapped_column(Packed(Coverage), deferred=True)
@@ -373,15 +377,16 @@ class PolicyVersion(Numbered):
     @property
     def of_any_outcome(self) -> bool:
         """True if it was trained from demonstrations of any outcome; its manifest then names the outcomes."""
-        return "outcomes" in self.manifest
+        return self.manifest.outcomes is not None
 
     @property
-    def objections(self) -> list[str]:
-        """The change of a demonstration that forbids a release: "was withdrawn" or "was marked failure"."""
+    def objections(self) -> list[GateRefusal]:
+        """The change of a demonstration that forbids a release: it "was withdrawn" or "was marked failure"."""
         demos = self.demonstrations
-        withdrawn = ["was withdrawn"] if any(one.withdrawn_at is not None for one in demos) else []
+        withdrawn = any(one.withdrawn_at is not None for one in demos)
         marked = set() if self.of_any_outcome else {f"was marked {one.outcome}" for one in demos if one.failed}
-        return [*withdrawn, *sorted(marked)]
+        changed = [GateRefusal("withdrawn", "was withdrawn")] if withdrawn else []
+        return changed + [GateRefusal("marked", text) for text in sorted(marked)]
 
 
 class StoredPoses(Numbered):
@@ -432,7 +437,7 @@ class Plan(Numbered):
 
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), index=True)
-    about: Mapped[dict[str, Any]]
+    about: Mapped[PlanDescription] = mapped_column(AsJson(PlanDescription))
     plan: Mapped[SuturePlan] = mapped_column(Packed(SuturePlan), deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
 
@@ -447,7 +452,7 @@ class StoredPlayback(Numbered):
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     plan_row: Mapped[int] = mapped_column(ForeignKey("plans.row"), index=True)
     feasible: Mapped[bool]
-    report: Mapped[dict[str, Any]]
+    report: Mapped[Verdict] = mapped_column(AsJson(Verdict))
     measured: Mapped[Playback] = mapped_column(Packed(Playback), deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
 

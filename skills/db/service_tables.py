@@ -22,10 +22,11 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
-from skills.db import Base, Number, Numbered, Sha256, now, partial_index
+from skills.db import AsJson, Base, Number, Numbered, Sha256, now, partial_index
 from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
 from skills.schemas.operation import JobState
+from skills.schemas.training import StoredComparison
 from skills.settings import Role
 
 LONGEST_REASON = 2000  # characters
@@ -102,7 +103,7 @@ class StyleToRetrain(Numbered):
     tries: Mapped[int] = mapped_column(default=0)
     policy_row: Mapped[int | None] = mapped_column(ForeignKey("policy_versions.row"), index=True)
     reason: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
-    comparison: Mapped[dict[str, Any] | None]
+    comparison: Mapped[StoredComparison | None] = mapped_column(AsJson(StoredComparison))
     ended_at: Mapped[datetime | None]
 
     demonstration: Mapped[Demonstration] = relationship(lazy="joined", innerjoin=True)

@@ -14,7 +14,8 @@ from skills.db import now
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.library.operation.jobs import PART, Store, names_of, while_running
-from skills.library.plans.playbacks import check_playback, draw_pictures
+from skills.library.plans.playback_pictures import draw_pictures
+from skills.library.plans.playbacks import check_playback
 from skills.library.plans.tries import TRY, perform_try
 from skills.library.policies.batches import retrain_part
 from skills.library.policies.training import train_style

@@ -4,6 +4,8 @@ Answers and requests of a noun are in one module: `people`, `recordings`, `demos
 The base class of requests and the types of their fields are in `requests`; requests are strict, unknown fields are
 refused. A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
 
+A use case returns the model of its answer; rows store parts of it as typed columns of JSON (`skills.db.AsJson`).
+
 Lengths are mm; the frame of a position is in a field of its own.
 """
 

@@ -171,7 +171,7 @@ class Pass(Given):
     states: list[int]
     path_mm: list[Point]
     jaw_xyzw: Quaternion = Field(description="The jaw at the start of A1.")
-    turn_deg: float = Field(default=0.0, description="Greatest angle of the jaw from its start during A1.")
+    turn_deg: float = Field(description="Greatest angle of the jaw from its start during A1.")
     target_xyzw: Quaternion | None = Field(description="The jaw after A2; null where A1 alone is planned.")
     transfer: Transfer | None
 
@@ -187,9 +187,9 @@ class Timetable(Given):
     )
     speed_used_mm_s: float
     tempo: float | None = Field(
-        default=None, description="The part of the surgeon's tempo in A1, at most 1; null where none is followed."
+        description="The part of the surgeon's tempo in A1, at most 1; null where none is followed."
     )
-    jaw: str = Field(default="constant", description="recorded along A1, or constant.")
+    jaw: str = Field(description="recorded along A1, or constant.")
     peak_joint_speed_ratio: float
     peak_joint_acceleration_ratio: float
     deviation_mm: float
@@ -206,14 +206,9 @@ class PlanScene(Given):
     scene: Scene
 
 
-class Plan(Given):
-    """Grid worlds stacked at suture points."""
+class PlanDescription(Given):
+    """What a plan does, without its digests."""
 
-    id: Sha256
-    sha256: Sha256
-    surgeon: Slug
-    suture: Slug
-    policy: PolicyName
     arm: str
     frame: str
     instrument: str
@@ -222,23 +217,38 @@ class Plan(Given):
         "tool-down, which is constant too."
     )
     departure: Departure | None = Field(
-        default=None, description="Of a constant orientation from the recorded one; null where there is none."
+        description="Of a constant orientation from the recorded one; null where there is none."
     )
     a2: str | None = Field(
-        default=None, description="recorded: ends in the demonstrated hand-off; or paper. Null without a hand-off."
+        description="recorded: ends in the demonstrated hand-off; or paper. Null without a hand-off."
     )
     path: str = Field(description="fitted, or cell centres.")
     psm_m: PsmM | None
     realignment: bool
     scene: PlanScene | None = Field(
-        default=None, description="Tissue and obstacles; null: none was stated, and nothing is compared with them."
+        description="Tissue and obstacles; null: none was stated, and nothing is compared with them."
     )
     speed_mm_s: float
     tip_offset_mm: float
     passes: list[Pass]
     trajectory: Timetable
-    hands_over: bool = Field(default=True, description="Whether a hand-off is planned: A2 towards PSM_M.")
-    in_words: str = Field(default="", description="What the plan does and what it leaves out.")
+
+    @property
+    def psm_m_moves(self) -> bool:
+        """Whether it moves PSM_M too; its base must be known for that."""
+        return self.psm_m is not None and self.trajectory.psm_m_moves
+
+
+class Plan(PlanDescription):
+    """Grid worlds stacked at suture points."""
+
+    id: Sha256
+    sha256: Sha256
+    surgeon: Slug
+    suture: Slug
+    policy: PolicyName
+    hands_over: bool = Field(description="Whether a hand-off is planned: A2 towards PSM_M.")
+    in_words: str = Field(description="What the plan does and what it leaves out.")
     created_at: datetime
 
 

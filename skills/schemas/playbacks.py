@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 from skills.fields import Count, Point, Sha256, schema
+from skills.packing import canonical, sha256
 from skills.schemas import Given, PolicyName
 from skills.schemas.requests import LINE, DigestField, Schema, Size, Source, shown
 from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
@@ -86,8 +87,20 @@ class Verdict(PlaybackReport):
     stated_by: Literal["request", "installation"]
     check_version: Count
 
+    @property
+    def identity(self) -> str:
+        """The digest of a playback: over its plan and this verdict as it is stored."""
+        plain = TypeAdapter(Verdict).dump_python(self, mode="json")
+        return sha256(canonical([self.plan, plain]))
 
-class StandingPolicy(PolicyName):
+
+def finite(verdict: Verdict) -> Verdict:
+    """Return a verdict with null for NaN and infinity, which JSON does not have."""
+    verdicts = TypeAdapter(Verdict)
+    return verdicts.validate_json(verdicts.dump_json(verdict))
+
+
+class FollowedPolicy(PolicyName):
     """The policy version that a plan follows, and whether it is released now."""
 
     released: bool
@@ -103,10 +116,14 @@ class PictureLinks(Given):
     clearance: str
 
 
+Level = Literal["good", "caution", "bad"]
+CountedEvent = Literal["hand-over", "clearance"]
+
+
 class Headline(Given):
     """A playback's headline: the verdict, the missing parts of the plan, and its probability of success."""
 
-    level: Literal["good", "caution", "bad"] = Field(
+    level: Level = Field(
         description="good: hands over, and succeeds as surely as the installation asks for a replay; bad: not "
         "feasible, or surely succeeds in less than half of the worlds."
     )
@@ -116,12 +133,11 @@ class Headline(Given):
         description="Name of the errors of the arms: those of the playback's request, or else of the installation."
     )
     probability: Probability | None = Field(description="Of the whole plan; null where it was not judged.")
-    counts: Literal["hand-over", "clearance"] | None = Field(
-        default=None,
+    counts: CountedEvent | None = Field(
         description="The event of the probability: the needle is handed over in every pass, or, without a hand-off, "
         "the motion only stays within reach and clear; null where it was not judged.",
     )
-    not_judged: list[str] = Field(default=[], description="What the probability leaves out, in words.")
+    not_judged: list[str] = Field(description="What the probability leaves out, in words.")
     costs_most: str | None = Field(description="The error that costs the most, in words; null where none was judged.")
 
 
@@ -132,12 +148,12 @@ class Playback(Given):
     sha256: Sha256
     plan: Sha256
     feasible: bool = Field(description="In an exact simulation, as far as the plan goes; read `headline`.")
-    headline: Headline | None = None
+    headline: Headline
     report: Verdict
     picture: str
     pictures: PictureLinks
     created_at: datetime
-    policy: StandingPolicy
+    policy: FollowedPolicy
 
 
 class Comparison(Given):

@@ -1,20 +1,22 @@
-"""Response models of jobs and policies."""
+"""Policies: their description, versions, rollouts and next steps."""
 
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, StrictInt
+from pydantic import AliasPath, Field, StrictInt
 
 from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
-from skills.gridworld.hazards import SceneCosts
+from skills.gridworld.hazards import SceneCosts, Surroundings
 from skills.gridworld.reward import RewardLevels
 from skills.gridworld.scene import Scene
 from skills.learning.certificate import NearOdds, NearStarts
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.in_scene import SceneCertificate
+from skills.learning.policy import Learner, learner_of
 from skills.learning.q_learning import Training
 from skills.learning.ties import ShortestApproach
+from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass
 from skills.schemas import DemoOutcome, Given, Grid, PolicyName
 from skills.schemas.requests import PointIn, Schema, shown
@@ -48,6 +50,38 @@ class Coverage:
     starts_goal_alone: Count
 
 
+RefusalKind = Literal[
+    "consent",
+    "withdrawn",
+    "marked",
+    "faint",
+    "not optimal",
+    "unreached",
+    "scene odds",
+    "frame",
+    "joint limits",
+    "jaw held",
+    "off rule",
+    "not reproduced",
+    "near starts",
+    "worse",
+]
+
+
+@schema
+@dataclass(frozen=True)
+class GateRefusal:
+    """A reason against the release of a policy, on its certificate or when it is to be released.
+
+    Attributes:
+        kind: The check that failed.
+        text: The reason with its numbers.
+    """
+
+    kind: RefusalKind
+    text: str
+
+
 @schema
 @dataclass(frozen=True, kw_only=True)
 class GridCertificate:
@@ -72,14 +106,11 @@ class GridCertificate:
     suboptimal_actions: Count
     actions_off_rule: Count | None
     demonstration_reproduced: bool
-    refused_because: tuple[str, ...]
+    refused_because: tuple[GateRefusal, ...]
     gate: int
     near: NearStarts
     driven: DrivenPass | None
     note: str
-
-
-JOINING_FORMAT = 2  # of a policy's JSON and arrays with a joining table; without one they name no format, which is 1
 
 
 @schema
@@ -154,11 +185,11 @@ class TrainingFigures(Training):
 class Version(PolicyName):
     """A version in a style's history."""
 
-    learner: str
-    demos: list[Sha256]
-    seed: Count
-    metrics: Metrics
-    coverage: Coverage
+    learner: str = Field(validation_alias=AliasPath("manifest", "learner"))
+    demos: list[Sha256] = Field(validation_alias=AliasPath("manifest", "demos"))
+    seed: Count = Field(validation_alias=AliasPath("manifest", "seed"))
+    metrics: Metrics = Field(validation_alias=AliasPath("manifest", "metrics"))
+    coverage: Coverage = Field(validation_alias=AliasPath("manifest", "coverage"))
     releasable: bool
     created_at: datetime
 
@@ -180,27 +211,10 @@ class PhaseActions(Given):
     actions: list[int] = Field(description="By cell of the box, that along z running fastest, then y, then x.")
 
 
-class Policy(PolicyName):
-    """A policy, complete enough that a client can run it.
+class PolicyManifest(Given):
+    """The description of a policy without its numbers; its version's digest covers both.
 
-    In a grid of shape (nx, ny, nz) the state of cell (i, j, k) is (i ny + j) nz + k. Action = 9a + 3b + c with a, b, c
-    in {0, 1, 2} for -1, 0, +1 cell along x, y, z; a move off the grid stays. -1: finished; -2: outside the certified
-    domain, a client stops there.
-
-    Phases and waypoints are counted from 0; the goal is the last waypoint. With one phase a pass ends at the goal. With
-    more, phase 0 means that the path is not joined yet, and phase p that waypoint p is next. A pass that starts on a
-    waypoint is in the phase after its first visit, and finished if that is the last waypoint. In phase 0 a move onto
-    the goal ends the pass, and one onto another waypoint leads to the phase after its first visit. In phase p > 0 a
-    move onto waypoint p leads to phase p + 1, or ends the pass if it is the last.
-
-    In format 2, `joining` replaces the rules of starting and of phase 0: a pass that starts in one of its states, or
-    moves onto it in phase 0, is then in the phase beside it; any other start is in phase 0, and any other move in phase
-    0 stays in it, also one onto a waypoint or the goal. There is no `actions`, which clients that know no `joining`
-    would follow wrongly; the same table is `actions_joining`. A client stops at a format that it does not know.
-
-    With `scene`, -2 stands also in cells that are forbidden there, and where the best move would touch; a client stops
-    as outside the certified domain. The straight lines between the centres of the cells were checked, not smoothed
-    ones, and the odds are those of a client that stops.
+    Attributes without a value are left out of the digest, so that one that is added later changes no digest.
     """
 
     surgeon: Slug
@@ -213,9 +227,9 @@ class Policy(PolicyName):
     goal_mm: Point
     waypoints: list[int] = Field(description="State index of each, in order.")
     phases: int = Field(ge=1)
-    learner: str
+    learner: str = Field(description="Kind of the learner.")
     learner_version: int
-    settings: dict[str, Any]
+    settings: dict[str, Any] = Field(description="Of the learner: which there are depends on its kind.")
     reward_levels: RewardLevels
     seed: Count
     demos: list[Sha256]
@@ -229,32 +243,76 @@ class Policy(PolicyName):
         default=None,
         description="Where it was trained from demonstrations of any outcome: that of each as it was then.",
     )
-    format: Literal[1, 2] = Field(default=1, description="Left out: 1. 2: with `joining`, see above.")
-    joining: Joining | None = Field(default=None, description="Of format 2.")
+    joining: Joining | None = Field(
+        default=None, description="Where a pass joins the path; null: at the nearest waypoint, see above."
+    )
     ties: ShortestApproach | None = Field(
         default=None,
-        description="The rule among equally good actions; null or absent: the lowest index. The actions follow it: "
+        description="The rule among equally good actions; null: the lowest index. The actions follow it: "
         "take them, and not the first largest of the Q values in the arrays.",
     )
     scene: PolicyScene | None = Field(
-        default=None, description="What must not be touched, where it was learnt so; absent: nothing was known of it."
+        default=None, description="What must not be touched, where it was learnt so; null: nothing was known of it."
     )
+
+    @property
+    def style(self) -> tuple[str, str]:
+        """The surgeon and the suture type."""
+        return self.surgeon, self.suture
+
+    @property
+    def space(self) -> tuple[str, str]:
+        """Arm and frame; paths in different ones cannot be compared."""
+        return self.arm, self.frame
+
+    @property
+    def learnt_with(self) -> Learner:
+        """The learner with its settings."""
+        return learner_of({"kind": self.learner, **self.settings})
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """The scene that it was learnt in, with its costs."""
+        return None if self.scene is None else Surroundings(self.scene.scene, self.scene.costs)
+
+    @property
+    def digested(self) -> dict[str, Any]:
+        """The plain JSON of which the digest is computed."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    def identity(self, numbers: str) -> str:
+        """Return the digest of a policy version with this manifest: over it and the digest of the policy's numbers."""
+        return sha256(canonical([self.digested, numbers]))
+
+
+class Policy(PolicyManifest, PolicyName):
+    """A policy, complete enough that a client can run it.
+
+    In a grid of shape (nx, ny, nz) the state of cell (i, j, k) is (i ny + j) nz + k. Action = 9a + 3b + c with a, b, c
+    in {0, 1, 2} for -1, 0, +1 cell along x, y, z; a move off the grid stays. -1: finished; -2: outside the certified
+    domain, a client stops there.
+
+    Phases and waypoints are counted from 0; the goal is the last waypoint. With one phase a pass ends at the goal. With
+    more, phase 0 means that the path is not joined yet, and phase p that waypoint p is next. A pass that starts on a
+    waypoint is in the phase after its first visit, and finished if that is the last waypoint. In phase 0 a move onto
+    the goal ends the pass, and one onto another waypoint leads to the phase after its first visit. In phase p > 0 a
+    move onto waypoint p leads to phase p + 1, or ends the pass if it is the last.
+
+    `joining` replaces the rules of starting and of phase 0: a pass that starts in one of its states, or moves onto it
+    in phase 0, is then in the phase beside it; any other start is in phase 0, and any other move in phase 0 stays in
+    it, also one onto a waypoint or the goal.
+
+    With `scene`, -2 stands also in cells that are forbidden there, and where the best move would touch; a client stops
+    as outside the certified domain. The straight lines between the centres of the cells were checked, not smoothed
+    ones, and the odds are those of a client that stops.
+    """
+
     created_at: datetime
     released_at: datetime | None
     released_by: str | None
-    actions: list[list[int]] | None = Field(
-        default=None,
-        description="By phase, then by state; null where there are over 10^6. Only of format 1, and always there.",
-    )
-    actions_joining: list[list[int]] | None = Field(
-        default=None, description="The same of format 2, for clients that know `joining`."
-    )
+    actions: list[list[int]] | None = Field(description="By phase, then by state; null where there are over 10^6.")
     live_actions: list[PhaseActions] | None = Field(
-        default=None,
-        description="Where `actions` is null: the actions of the certified domain, by phase; otherwise absent.",
-    )
-    live_actions_joining: list[PhaseActions] | None = Field(
-        default=None, description="The same where `actions_joining` is null."
+        description="Where `actions` is null: the actions of the certified domain, by phase."
     )
     arrays: str = Field(description="Where the arrays with the Q values are.")
 

@@ -1,4 +1,4 @@
-"""The document of a policy: the layout of its actions in JSON, and the digest under which it is cited.
+"""The document of a policy: the layout of its actions in JSON, and the digest of its numbers.
 
 The service writes and verifies policies with this module, and so does the client, which has no database.
 """
@@ -15,7 +15,8 @@ from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.q_learning import Training
 from skills.learning.ties import ShortestApproach
-from skills.packing import canonical, digest_of, flatten, known, sha256, store_as_palette
+from skills.packing import digest_of, flatten, known, store_as_palette
+from skills.schemas.policies import PhaseActions
 
 MAX_JSON_ACTIONS = 10**6  # ours: above it, JSON has the certified domain alone, in `live_actions`
 # The classes of a policy and of its parts.
@@ -26,39 +27,22 @@ POLICY_CLASSES |= known(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
 store_as_palette(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 
-def policy_identity(manifest: dict[str, Any], policy: Policy) -> str:
-    """Return a policy version's digest: over its manifest (all that the API says of it) and its numbers."""
+def digest_of_numbers(policy: Policy) -> str:
+    """Return the digest of a policy's numbers, the part of its version's digest beside `PolicyManifest.identity`."""
     arrays: list[Any] = []
-    return policy_identity_of(manifest, digest_of(flatten(policy, arrays, POLICY_CLASSES), arrays))
-
-
-def policy_identity_of(manifest: dict[str, Any], numbers: str) -> str:
-    """Return a policy version's digest from its manifest and the digest of its numbers, see `policy_identity`."""
-    return sha256(canonical([manifest, numbers]))
-
-
-def table_name(manifest: dict[str, Any], name: str) -> str:
-    """Return the name under which a policy's actions are served: another one in a format with a joining table.
-
-    A client that does not know the joining table then finds no actions, and cannot follow them by the wrong rule.
-
-    Args:
-        manifest: The policy's manifest.
-        name: The name in the first format.
-    """
-    return f"{name}_joining" if "joining" in manifest else name
+    return digest_of(flatten(policy, arrays, POLICY_CLASSES), arrays)
 
 
 def actions_of(policy: Policy) -> list[list[int]] | None:
-    """Return the greedy actions as JSON, by phase and state; None if there are more than `MAX_JSON_ACTIONS`."""
+    """Return the greedy actions by phase and state; None if there are more than `MAX_JSON_ACTIONS`."""
     if policy.domain.phases * policy.path.grid.n_states > MAX_JSON_ACTIONS:
         return None
     table: list[list[int]] = policy.table().tolist()
     return table
 
 
-def live_actions_of(policy: Policy) -> list[dict[str, list[int]]] | None:
-    """Return the greedy actions of the certified domain as JSON (`schemas.policies.PhaseActions`), by phase.
+def live_actions_of(policy: Policy) -> list[PhaseActions] | None:
+    """Return the greedy actions of the certified domain by phase.
 
     There are at most `skills.learning.policy.MAX_BYTES` / `BYTES_A_ROW` actions, 7 million; a larger policy cannot be
     learnt.
@@ -71,6 +55,6 @@ def live_actions_of(policy: Policy) -> list[dict[str, list[int]]] | None:
         return None
     of_phases = np.split(policy.greedy, domain.offset[1:-1])
     return [
-        {"low": low, "size": size, "actions": actions.tolist()}
+        PhaseActions.model_construct(low=low, size=size, actions=actions.tolist())
         for low, size, actions in zip(domain.low.tolist(), domain.size.tolist(), of_phases, strict=True)
     ]

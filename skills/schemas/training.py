@@ -174,6 +174,7 @@ class StoredComparison:
         worse_because: The figures in which the new version is worse.
         now_released: Whether the trained version is what the style serves now.
         not_released_because: Why a requested release is not in force.
+        remedy: What to do about it.
     """
 
     released: PolicyFigures | None
@@ -183,6 +184,7 @@ class StoredComparison:
     worse_because: tuple[str, ...]
     now_released: bool
     not_released_because: str | None
+    remedy: str | None
 
 
 @schema
@@ -192,11 +194,26 @@ class StyleComparison(StoredComparison):
 
     Attributes:
         was_released: Whether the batch released it.
-        remedy: What to do about a release that is not in force.
     """
 
     was_released: bool
-    remedy: str | None
+
+
+class TrainingResult(Given):
+    """The result of a training's job, as it is stored: its version, and the effect on what the style serves."""
+
+    policy_version: VersionNumber
+    sha256: Sha256
+    releasable: bool
+    released: bool = Field(description="Whether the version is what the style serves now.")
+    not_released_because: str | None = Field(description="Why a requested release is not in force.")
+    remedy: str | None = Field(description="What to do about it.")
+
+
+class ServedTraining(TrainingResult):
+    """The result of a training's job now."""
+
+    was_released: bool = Field(description="Whether the job released it.")
 
 
 class RetrainedStyle(Given):

@@ -53,7 +53,7 @@ def test_its_view_and_its_card_show_the_way_that_is_followed(trained: Service, k
 
 
 def test_one_alone_says_nothing_of_combining(trained: Service):
-    assert "combined" not in trained.client.get_json(POLICY)
+    assert trained.client.get_json(POLICY)["combined"] is None
     assert Client(trained.http).policy(**KESTREL).combined is None
 
 

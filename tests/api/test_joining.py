@@ -1,10 +1,9 @@
-"""The format of a policy by another joining rule: clients of the first format find no actions, newer ones follow it."""
+"""The JSON and the arrays of a policy by another joining rule, and a client that follows them."""
 
 import io
 
 import numpy as np
 import pytest
-from pydantic import BaseModel, ValidationError
 
 from skills.errors import Corrupt
 from skills.learning.policy import rollout_from
@@ -16,14 +15,6 @@ NPZ = {"Accept": "application/x-npz"}
 HALF = {"kind": "phase-q-learning", "join_share": 0.5}
 
 
-class PolicyOfFormatOne(BaseModel):
-    """The fields by which a client of 0.1.0 follows a policy; it ignores those that it does not know."""
-
-    waypoints: list[int]
-    phases: int
-    actions: list[list[int]] | None
-
-
 def by_rule(service: Service) -> dict:
     service.client.train(**KESTREL, learner=HALF, release=True)
     service.work()
@@ -32,9 +23,9 @@ def by_rule(service: Service) -> dict:
 
 def test_a_client_follows_the_json_by_its_joining_table_from_every_start(trained: Service):
     about = by_rule(trained)
-    assert (about["format"], about["joining"]["join_share"]) == (2, 0.5)
+    assert about["joining"]["join_share"] == 0.5
     table = dict(zip(about["joining"]["states"], about["joining"]["phases"], strict=True))
-    actions, shape = np.array(about["actions_joining"]), tuple(about["grid"]["shape"])
+    actions, shape = np.array(about["actions"]), tuple(about["grid"]["shape"])
     policy = rebuilt(about, trained.http.get(POLICY, headers=NPZ).content, demo_of(trained, about))
     for start in range(0, np.prod(shape), 7):
         states, finished = follow(actions, shape, about["waypoints"], start, table)
@@ -52,33 +43,21 @@ def demo_of(service: Service, about: dict) -> dict:
     return service.http.get(f"/demos/{about['demos'][0]}").json()
 
 
-def test_a_client_of_the_first_format_finds_no_actions_to_follow(trained: Service):
-    first = trained.http.get(POLICY).json()
-    assert PolicyOfFormatOne.model_validate(first).actions == first["actions"]
-    assert not {"format", "joining", "actions_joining"} & set(first)
+def test_the_joining_table_is_in_the_json_the_arrays_and_the_digest(trained: Service):
+    assert trained.http.get(POLICY).json()["joining"] is None, "by the rule nearest"
     about = by_rule(trained)
-    assert "actions" not in about
-    with pytest.raises(ValidationError, match="actions"):
-        PolicyOfFormatOne.model_validate(about)
-    with np.load(io.BytesIO(trained.http.get(POLICY, headers=NPZ).content)) as arrays:
-        assert "action" not in arrays
-        assert arrays["format"] == 2
+    sent, demo = trained.http.get(POLICY, headers=NPZ).content, demo_of(trained, about)
+    with np.load(io.BytesIO(sent)) as arrays:
         table = {int(state): int(arrays["joins"][state]) for state in np.flatnonzero(arrays["joins"])}
         assert table == dict(zip(about["joining"]["states"], about["joining"]["phases"], strict=True))
-        sent = np.array(about["actions_joining"])[arrays["phase"], arrays["state"]]
-        assert sent.tolist() == arrays["action_joining"].tolist()
+        actions = np.array(about["actions"])[arrays["phase"], arrays["state"]]
+        assert actions.tolist() == arrays["action"].tolist()
         assert arrays["share"].mean() == about["coverage"]["mean_share"]
-
-
-def test_a_format_that_the_client_does_not_know_is_refused(trained: Service):
-    about = by_rule(trained)
-    arrays, demo = trained.http.get(POLICY, headers=NPZ).content, demo_of(trained, about)
-    rebuilt(about, arrays, demo)
-    with pytest.raises(Corrupt):
-        rebuilt(about | {"format": 3}, arrays, demo)
+    rebuilt(about, sent, demo)
     moved = about["joining"] | {"phases": [phase + 1 for phase in about["joining"]["phases"]]}
-    with pytest.raises(Corrupt, match="does not match its digest"):
-        rebuilt(about | {"joining": moved}, arrays, demo)
+    for other in (moved, None):
+        with pytest.raises(Corrupt, match="does not match its digest"):
+            rebuilt(about | {"joining": other}, sent, demo)
 
 
 def test_next_and_rollouts_follow_the_rule_and_older_versions_come_back(trained: Service):

@@ -11,7 +11,7 @@ import pytest
 from skills.client import Problem
 from skills.learning.pose_style import PHASES
 from skills.library.people.keys import create_key
-from skills.library.policies.versions import FORMAT
+from skills.library.policies.pose_styles import FORMAT
 from skills.schemas.pose_styles import NextPose, PoseStyle
 from tests import backends
 from tests.api.posed import of_both_arms, of_pose_style
@@ -111,7 +111,7 @@ def test_next_has_the_other_arm_at_the_phase_that_it_answers(both: Service):
 
 def test_where_one_arm_was_recorded_the_answers_have_no_other(posed: Service):
     style = posed.client.pose_style(**KESTREL)
-    assert "partner_motion" not in style and style["partner"] is None  # the bytes of before
+    assert style["partner_motion"] is None and style["partner"] is None
     pose = {name: style[name][0] for name in ("position_mm", "rotation_xyzw")}
     assert posed.client.next_pose(**KESTREL, **pose)["partner_pose"] is None
     older = {name: value for name, value in posed.client.next_pose(**KESTREL, **pose).items() if name != "partner_pose"}

@@ -10,7 +10,7 @@ from skills.errors import Corrupt
 from skills.gridworld.scene import Box, Scene, Tissue
 from skills.learning.policy import rollout_from
 from skills.library.operation.inspection import inspect_installation
-from skills.library.plans.plans import differences
+from skills.library.plans.description import differences
 from tests.api.service import GOAL_MM, KESTREL, POLICY, Service, assert_problem
 from tests.client.peers import rebuilt
 from tests.gridworld.paths import follow

@@ -37,8 +37,8 @@ from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation.jobs import PART, attempts_to_submit
 from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
+from skills.library.policies.learning import Lesson, learn_style, lessons
 from skills.library.policies.retraining import request_retraining
-from skills.library.policies.training import Lesson, learn_style, lessons
 from skills.library.recordings.demos import upload_demo
 from skills.schemas.demos import DemoIn
 from skills.schemas.people import SurgeonIn

@@ -21,7 +21,8 @@ from rich.table import Table
 from skills.db.session import Database
 from skills.learning.pose_step import next_pose
 from skills.library.policies import releases
-from skills.library.policies.versions import policy_of, poses_of
+from skills.library.policies.pose_styles import poses_of
+from skills.library.policies.versions import policy_of
 from skills.serving import environment
 from skills.settings import Settings
 from tests import backends

@@ -89,13 +89,13 @@ def test_no_live_action_of_a_large_policy_can_be_changed(fetched: Fetched, monke
     about, arrays, demo = fetched
     policy = rebuilt(about, arrays, demo)
     monkeypatch.setattr(policy_document, "MAX_JSON_ACTIONS", 0)
-    live = policy_document.live_actions_of(policy)
+    live = [box.model_dump() for box in policy_document.live_actions_of(policy) or ()]
     large = about | {"actions": None, "live_actions": live}
     rebuilt(large, arrays, demo)
     for path in (("live_actions", 1, "low", 0), ("live_actions", 1, "size", 2), ("live_actions", 2, "actions", 7)):
         with pytest.raises(Corrupt):
             rebuilt(changed(large, path), arrays, demo)
-    for none in ({"live_actions": (live or [])[:-1]}, {"live_actions": None}):
+    for none in ({"live_actions": live[:-1]}, {"live_actions": None}):
         with pytest.raises(Corrupt):
             rebuilt(large | none, arrays, demo)
 

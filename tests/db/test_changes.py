@@ -16,7 +16,7 @@ from skills.db import now
 from skills.db.changes import APPLICATION, BOUND_S, Changes, Unasked, announce, changes_of
 from skills.db.service_tables import Executor, record_event
 from skills.db.session import Database
-from skills.library.policies.releases import STANDS
+from skills.library.policies.releases import NEWEST_RELEASE
 from tests import backends
 from tests.waiting import END_S, crowded
 
@@ -120,7 +120,7 @@ def test_sqlite_reports_every_commit_at_once_including_heartbeats(tmp_path: Path
     async def story(changes: Changes, another: Database) -> None:
         for work in (change, beat) * 20:
             before = changes.version()
-            assert changes.first(STANDS, NOBODY) is None
+            assert changes.first(NEWEST_RELEASE, NOBODY) is None
             assert changes.version() == before
             work(another)
             assert changes.version() != before
@@ -143,7 +143,7 @@ def test_postgresql_reports_own_commits_at_once_and_no_heartbeats(tmp_path: Path
     async def story(changes: Changes, another: Database) -> None:
         await unchanged_by(changes, lambda: beat(another))
         with pytest.raises(Unasked):
-            changes.first(STANDS, NOBODY)
+            changes.first(NEWEST_RELEASE, NOBODY)
 
     told("postgresql", tmp_path, story)
 

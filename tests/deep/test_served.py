@@ -25,7 +25,7 @@ from skills.learning.q_learning import Training
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.integrity import learnt
 from skills.library.policies import releases
-from skills.library.policies.training import certified, lessons, store_style
+from skills.library.policies.learning import certified, lessons, store_style
 from skills.library.recordings.demos import find_demo
 from tests.api.conftest import service  # noqa: F401 - a fixture
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service

@@ -106,7 +106,7 @@ def stored(database: Database) -> Stored:
             "recording": Counter(session.scalars(select(recording.sha256))),
             "upload": Counter(session.scalars(cut)),
             "training": Counter(request["demos"][0] for request in jobs),
-            "policy version": Counter(found["demos"][0] for found in session.scalars(select(policy.manifest))),
+            "policy version": Counter(found.demos[0] for found in session.scalars(select(policy.manifest))),
             "release": Counter(session.scalars(released)),
             "event": Counter({f"{action} {kind} {name}": n for action, kind, name, n in events if n > 1}),
         }
@@ -131,7 +131,7 @@ def _demos_of_policies(database: Database) -> dict[str, str]:
     """Return, by policy, the demonstration from which it was learnt."""
     with database.reading() as session:
         found = session.execute(select(PolicyVersion.sha256, PolicyVersion.manifest)).all()
-    return {policy: manifest["demos"][0] for policy, manifest in found}
+    return {policy: manifest.demos[0] for policy, manifest in found}
 
 
 def _missing_upload(one: Ask, http: httpx.Client) -> list[str]:

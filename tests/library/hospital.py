@@ -91,14 +91,14 @@ def _add_styles(session: Session, styles: list[Style]) -> None:
         recording = sha256(data + surgeon.encode()) if surgeon != FIRST else real.recording.sha256
         name = demo_identity(recording, surgeon, suture, demo, path)
         demos.append(first | mine | {"sha256": name, "recording_row": recordings[(recording,)]})
-        manifest = policy["manifest"] | {"surgeon": surgeon, "suture": suture, "demos": [name]}
+        manifest = policy["manifest"].model_copy(update={"surgeon": surgeon, "suture": suture, "demos": [name]})
         training = sha256(canonical([policy["training"], name]))
-        about = {"manifest": manifest, "training": training, "sha256": sha256(canonical([manifest, learnt]))}
+        about = {"manifest": manifest, "training": training, "sha256": manifest.identity(learnt)}
         versions.append(policy | mine | about)
     _add(session, Demonstration, demos)
     rows = _rows(session, Demonstration, "sha256")
     _add(session, StoredRewardMap, (reward | {"demonstration_row": rows[(demo["sha256"],)]} for demo in demos))
-    rests = ({"demonstration_row": rows[tuple(version["manifest"]["demos"])]} for version in versions)
+    rests = ({"demonstration_row": rows[tuple(version["manifest"].demos)]} for version in versions)
     _add(session, PolicyVersion, (version | on for version, on in zip(versions, rests, strict=True)))
     rows = _rows(session, PolicyVersion, "sha256")
     style = ("surgeon_row", "suture")

@@ -312,7 +312,7 @@ def test_a_surgeon_has_the_share_that_starts_of_the_served_policy_follow(databas
     def shares() -> list[float | None]:
         return [one.mean_share for one in atlas_of(database, SUTURE).surgeons]
 
-    served = round(policy.manifest["coverage"]["mean_share"], 4)
+    served = round(policy.manifest.coverage.mean_share, 4)
     assert 0.0 < served < 1.0
     assert shares() == [served, None]
     with database.writing() as session:

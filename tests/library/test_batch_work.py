@@ -12,7 +12,7 @@ from skills.jobs.workflows import Work, fail, start
 from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job
 from skills.library.policies import batches, retraining
-from skills.library.policies.training import learn_style
+from skills.library.policies.learning import learn_style
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings

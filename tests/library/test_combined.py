@@ -21,8 +21,9 @@ from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans.plans import hand_of, trajectory_of
 from skills.library.policies import training
 from skills.library.policies.cards import card_of
-from skills.library.policies.releases import release, standing
-from skills.library.policies.versions import find_by_digest, learnt_from, path_of
+from skills.library.policies.combined import learnt_from, path_of
+from skills.library.policies.releases import in_force, release
+from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import upload_demo, withdraw_demo
 from skills.schemas.demos import DemoIn
 from skills.settings import Settings
@@ -59,24 +60,24 @@ def rows(database: Database, table) -> int:
 def served(database: Database) -> list[int]:
     with database.reading() as session:
         (surgeon,) = session.scalars(select(Demonstration.surgeon_row).distinct())
-        return [one.policy.version for one in standing(session, surgeon, cases.SUTURE)]
+        return [one.policy.version for one in in_force(session, surgeon, cases.SUTURE)]
 
 
 @HOWS
 def test_it_names_all_of_them_passes_the_gate_and_is_verified(database: Database, how):
     demos = add_three(database)
     version = train(database, demos, combine=how, release=True)
-    assert version.manifest["demos"] == [demo.sha256 for demo in demos]
+    assert version.manifest.demos == [demo.sha256 for demo in demos]
     assert (version.releasable, served(database), wrong(database)) == (True, [1], [])
     assert rows(database, PolicyDemonstration) == 2
     with database.reading() as session:
         stored = find_by_digest(session, version.sha256)
-        assert [one.sha256 for one in stored.demonstrations] == version.manifest["demos"]
+        assert [one.sha256 for one in stored.demonstrations] == version.manifest.demos
         assert digest(path_of(stored)) == digest(learnt(stored).path)
-    said = version.manifest["combined"]
-    assert said["kind"] == how.kind
-    assert len(said["width_mm"]) == len(version.manifest["waypoints"])
-    assert len(said["apart_mm"]) == 3
+    said = version.manifest.combined
+    assert said.kind == how.kind
+    assert len(said.width_mm) == len(version.manifest.waypoints)
+    assert len(said.apart_mm) == 3
 
 
 def test_demos_are_combined_as_a_corridor_by_default_in_any_order(database: Database):
@@ -90,7 +91,7 @@ def test_demos_are_combined_as_a_corridor_by_default_in_any_order(database: Data
 def test_the_medoid_is_one_of_them_and_its_path_that_ones(database: Database):
     demos = add_three(database)
     version = train(database, demos, combine=Medoid())
-    assert version.manifest["combined"]["medoid"] == demos[2].sha256  # which lies between the others
+    assert version.manifest.combined.medoid == demos[2].sha256  # which lies between the others
     with database.reading() as session:
         stored = find_by_digest(session, version.sha256)
         assert stored.demonstration.sha256 == demos[2].sha256
@@ -185,7 +186,7 @@ def test_a_plan_follows_it_and_a_card_tells_of_it(database: Database, how):
     assert "3 recorded demonstrations" in card.facts.what_it_is[0]
     assert card.facts.combined.kind == how.kind
     links = [(link.what, link.sha256) for link in card.facts.lineage.chain]
-    assert [sha256 for what, sha256 in links if what == "demonstration"] == version.manifest["demos"]
+    assert [sha256 for what, sha256 in links if what == "demonstration"] == version.manifest.demos
     assert links[-1] == ("policy", version.sha256)
 
 
@@ -221,7 +222,7 @@ def test_what_cannot_be_combined_is_refused_before_a_job_is_made(database: Datab
 def test_one_alone_is_asked_for_and_known_as_it_always_was(database: Database):
     demo, *_ = add_three(database)
     version = cases.train(database, demos=[demo.sha256])
-    assert "combined" not in version.manifest
+    assert version.manifest.combined is None
     assert version.sha256 == cases.train(database, demos=[demo.sha256]).sha256
     assert "combine" not in cases.ask_training(database, demos=[demo.sha256]).request
 

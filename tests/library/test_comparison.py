@@ -7,7 +7,7 @@ from skills.db.models import Demonstration, Plan
 from skills.db.session import Database
 from skills.errors import BadPlan, NotFound
 from skills.library.plans.plans import find_plan, trajectory_of
-from skills.library.plans.replay import compare_with_plan
+from skills.library.plans.replay_comparison import compare_with_plan
 from tests.library import cases
 
 

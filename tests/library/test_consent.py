@@ -19,7 +19,7 @@ from skills.library.people import consent
 from skills.library.people.consent import covered, may
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.plans import plans
-from skills.library.policies import batches, releases, retraining, training, versions
+from skills.library.policies import batches, learning, releases, retraining, versions
 from skills.schemas.people import Consent, SurgeonIn
 from skills.schemas.scores import ScoreIn
 from tests.library import cases
@@ -82,7 +82,7 @@ def test_consent_withdrawn_during_training_stores_and_releases_nothing(
 ):
     cases.add_demo(database)
     job = cases.ask_training(database, release=True)
-    midway(monkeypatch, training, "learn_policy", lambda: agree(database, NO_TRAINING))
+    midway(monkeypatch, learning, "learn_policy", lambda: agree(database, NO_TRAINING))
     ended = cases.work(database, job)
     assert ended.state == "failed"
     assert "does not cover training" in ended.error
@@ -123,7 +123,7 @@ def test_in_a_batch_nobody_learns_from_whom_consent_was_withdrawn_before(
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
     learnt: list[str] = []
-    learn = training.learn_policy
+    learn = learning.learn_policy
 
     def withdrawing(*given: Any, **named: Any) -> Any:
         if not learnt:
@@ -131,7 +131,7 @@ def test_in_a_batch_nobody_learns_from_whom_consent_was_withdrawn_before(
         learnt.append("a style")
         return learn(*given, **named)
 
-    monkeypatch.setattr(training, "learn_policy", withdrawing)
+    monkeypatch.setattr(learning, "learn_policy", withdrawing)
     cases.work(database, part)
     assert (len(learnt), states_of(database, job).count("failed")) == (first, 14 - first)
 

@@ -225,7 +225,7 @@ def test_a_batch_uses_no_number_again_either(database: Database):
     cases.work(database, part)
     with database.reading() as session:
         (version,) = session.scalars(select(PolicyVersion)).all()
-    assert (version.version, version.manifest["demos"]) == (2, [demo])
+    assert (version.version, version.manifest.demos) == (2, [demo])
 
 
 @pytest.mark.parametrize("erased", [False, True])

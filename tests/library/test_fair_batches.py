@@ -8,9 +8,9 @@ import pytest
 
 from skills.db.models import PolicyVersion
 from skills.db.session import Database
-from skills.fields import as_json
-from skills.library.policies import batches, releases, versions
-from skills.library.policies.releases import fit_of_versions, not_worse
+from skills.gridworld.grid import GridWorld
+from skills.library.policies import batches, fit, releases, versions
+from skills.library.policies.fit import compare_versions, not_worse
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.demos import DemoIn
 from skills.schemas.training import FitOnTheSame
@@ -44,16 +44,16 @@ def test_a_policy_of_three_demos_is_retrained_on_the_newest_three(database: Data
     cases.train(database, demos=three, release=True)
     (newest,) = demos(database, 5.0)
     comparison = compared(database)
-    assert comparison["trained"]["demos"] == [*three[1:], newest]
-    assert (comparison["released"]["rests_on"], comparison["trained"]["rests_on"]) == (3, 3)
-    assert comparison["on_the_same"]["demos"] == [*three, newest]
+    assert comparison.trained.demos == (*three[1:], newest)
+    assert (comparison.released.rests_on, comparison.trained.rests_on) == (3, 3)
+    assert comparison.on_the_same.demos == (*three, newest)
     with database.reading() as session:
-        trained = versions.find_by_digest(session, comparison["trained"]["sha256"])
-        before = versions.find_by_digest(session, comparison["released"]["sha256"])
-        assert trained.manifest["combined"]["kind"] == before.manifest["combined"]["kind"] == "corridor"
-        found = fit_of_versions(session, before, trained)
-    assert comparison["on_the_same"] == as_json(found)
-    assert comparison["now_released"] == not_worse(found) == (served(database).sha256 == trained.sha256)
+        trained = versions.find_by_digest(session, comparison.trained.sha256)
+        before = versions.find_by_digest(session, comparison.released.sha256)
+        assert trained.manifest.combined.kind == before.manifest.combined.kind == "corridor"
+        found = compare_versions(session, before, trained)
+    assert comparison.on_the_same == found
+    assert comparison.now_released == not_worse(found) == (served(database).sha256 == trained.sha256)
 
 
 @pytest.mark.parametrize(
@@ -70,17 +70,17 @@ def test_three_replace_three_only_where_they_follow_all_five_better(
     old = served(database).sha256
     added = demos(database, *added_mm)
     comparison = compared(database)
-    assert comparison["trained"]["demos"] == [three[2], *added]
-    assert (comparison["released"]["rests_on"], comparison["trained"]["rests_on"]) == (3, 3)
-    fit = comparison["on_the_same"]
-    assert fit["demos"] == [*three, *added]
-    nearer, further = sorted((fit["released_mm"], fit["trained_mm"]))
+    assert comparison.trained.demos == (three[2], *added)
+    assert (comparison.released.rests_on, comparison.trained.rests_on) == (3, 3)
+    fit = comparison.on_the_same
+    assert fit.demos == (*three, *added)
+    nearer, further = sorted((fit.released_mm, fit.trained_mm))
     assert further > 1.2 * nearer
-    assert (fit["trained_mm"] < fit["released_mm"]) == comparison["now_released"] == better
+    assert (fit.trained_mm < fit.released_mm) == comparison.now_released == better
     assert (served(database).sha256 == old) != better
-    assert len(served(database).manifest["demos"]) == 3
+    assert len(served(database).manifest.demos) == 3
     if not better:
-        (why,) = comparison["worse_because"]
+        (why,) = comparison.worse_because
         assert why.startswith("DTW ") and why.endswith("on the same 5 demonstrations")
 
 
@@ -98,14 +98,14 @@ def test_a_policy_of_the_newest_alone_does_not_replace_one_of_three(
 
     monkeypatch.setattr(batches, "_commit", released_before)
     comparison = compared(database)
-    assert (comparison["released"]["rests_on"], comparison["trained"]["rests_on"]) == (3, 1)
-    assert comparison["on_the_same"]["demos"] == three
-    assert comparison["on_the_same"]["trained_mm"] > comparison["on_the_same"]["released_mm"] > 0
-    assert comparison["trained"]["dtw_total_mm"] == 0, "against its own it is always the nearest"
-    assert not comparison["now_released"]
-    assert "on the same 3 demonstrations" in comparison["not_released_because"]
-    assert "it was learnt from 1 of them, the released one from 3" in comparison["not_released_because"]
-    assert len(served(database).manifest["demos"]) == 3
+    assert (comparison.released.rests_on, comparison.trained.rests_on) == (3, 1)
+    assert comparison.on_the_same.demos == tuple(three)
+    assert comparison.on_the_same.trained_mm > comparison.on_the_same.released_mm > 0
+    assert comparison.trained.dtw_total_mm == 0, "against its own it is always the nearest"
+    assert not comparison.now_released
+    assert "on the same 3 demonstrations" in comparison.not_released_because
+    assert "it was learnt from 1 of them, the released one from 3" in comparison.not_released_because
+    assert len(served(database).manifest.demos) == 3
 
 
 def test_one_released_while_the_comparison_was_computed_is_compared_anew(
@@ -123,17 +123,17 @@ def test_one_released_while_the_comparison_was_computed_is_compared_anew(
 
     monkeypatch.setattr(batches, "_measured", released_after)
     comparison = compared(database)
-    assert (comparison["released"]["rests_on"], comparison["now_released"]) == (3, False)
+    assert (comparison.released.rests_on, comparison.now_released) == (3, False)
 
 
 def test_an_equally_distant_newer_demo_replaces_the_older_one(database: Database):
     older, newer = demos(database, *SWERVES_MM[:2])
     cases.train(database, demos=[older], release=True)
     comparison = compared(database)
-    same = comparison["on_the_same"]
-    assert same["demos"] == [older, newer]
-    assert same["trained_mm"] == pytest.approx(same["released_mm"], abs=1e-6) and same["trained_mm"] > 0
-    assert comparison["now_released"]
+    same = comparison.on_the_same
+    assert same.demos == (older, newer)
+    assert same.trained_mm == pytest.approx(same.released_mm, abs=1e-6) and same.trained_mm > 0
+    assert comparison.now_released
 
 
 def test_a_style_whose_demos_cannot_be_combined_fails_and_stays_served(database: Database):
@@ -159,13 +159,13 @@ def test_what_cannot_be_compared_is_worse(totals_mm: tuple[float, float]):
 
 
 def test_in_another_frame_nothing_is_compared():
-    path = releases.GridPath(releases.GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), releases.np.array([0, 1, 2]))
-    ways = [releases.PolicyWay(path.tip_mm, ("PSM2", frame)) for frame in ("PSM2_base", "jigsaws")]
-    one = releases.Taught("a" * 64, ("PSM2", "PSM2_base"), path)
-    found = releases.fit_of(*ways, [one])
+    path = fit.GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), fit.np.array([0, 1, 2]))
+    ways = [fit.PolicyPath(path.tip_mm, ("PSM2", frame)) for frame in ("PSM2_base", "jigsaws")]
+    one = fit.ReferencePath("a" * 64, ("PSM2", "PSM2_base"), path)
+    found = fit.compare_paths(*ways, [one])
     assert (not_worse(found), found.released_mm, found.trained_mm) == (False, None, None)
-    assert not_worse(releases.fit_of(ways[0], ways[0], [one]))
-    assert not not_worse(releases.fit_of(ways[0], ways[0], []))
+    assert not_worse(fit.compare_paths(ways[0], ways[0], [one]))
+    assert not not_worse(fit.compare_paths(ways[0], ways[0], []))
 
 
 def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(database: Database):
@@ -175,7 +175,7 @@ def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(datab
     trained = cases.train(database, demos=three[:1], learner=cases.PUBLISHED)
     with database.writing() as session:
         version = versions.find_by_digest(session, trained.sha256)
-        found = fit_of_versions(session, versions.policy_of(session, "kestrel", cases.SUTURE).policy, version)
+        found = compare_versions(session, versions.policy_of(session, "kestrel", cases.SUTURE).policy, version)
         assert found.demos == tuple(three)
         with pytest.raises(releases.Conflict) as refused:
             releases.release(session, version, "test")
@@ -189,5 +189,5 @@ def test_a_demonstration_that_was_withdrawn_is_not_compared_with(database: Datab
     with database.writing() as session:
         withdraw_demo(session, three[0], "test")
     with database.reading() as session:
-        versions = [versions.find_by_digest(session, one.sha256) for one in (first, second)]
-        assert fit_of_versions(session, *versions).demos == (three[1],)
+        pair = [versions.find_by_digest(session, one.sha256) for one in (first, second)]
+        assert compare_versions(session, *pair).demos == (three[1],)

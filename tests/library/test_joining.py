@@ -15,7 +15,7 @@ from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library.operation.integrity import covered, learnt
 from skills.library.policies import releases
-from skills.library.policies.releases import refusals
+from skills.library.policies.gate import refusals
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import near_limits, request_training
 from skills.schemas.training import RetrainingIn, TrainingIn
@@ -37,16 +37,17 @@ def test_a_loop_that_ends_beside_its_start_is_refused_with_the_remedy(database):
     cases.add_surgeon(database)
     cases.add_demo(database, loop())
     version = cases.train(database)
-    certificate = version.manifest["grid_certificate"]
-    assert certificate["near"] == {"radius_mm": 3.0, "least_share": 0.4, "starts": 7, "share": 0.0}
-    (reason,) = certificate["refused_because"]
+    certificate = version.manifest.grid_certificate
+    assert certificate.near == NearStarts(radius_mm=3.0, least_share=0.4, starts=7, share=0.0)
+    (refused,) = certificate.refused_because
+    reason = refused.text
     assert reason.startswith("of 7 starts within 3 mm of the demonstrated one, one follows only 0% of the demonstr")
     assert "train with a joining rule such as --join 0.5" in reason
     with database.writing() as session, pytest.raises(Conflict, match=r"--join 0\.5"):
         releases.release(session, session.merge(version), "test")
     mended = cases.train(database, learner=HALF)
-    assert mended.manifest["grid_certificate"]["refused_because"] == []
-    assert mended.manifest["grid_certificate"]["near"]["share"] >= 0.5
+    assert mended.manifest.grid_certificate.refused_because == ()
+    assert mended.manifest.grid_certificate.near.share >= 0.5
     with database.writing() as session:
         releases.release(session, session.merge(mended), "test")
 
@@ -86,25 +87,24 @@ def test_the_default_of_the_settings_is_that_of_the_gate():
     assert near_limits(Settings()) == NearLimits()
 
 
-def test_a_manifest_states_shares_and_by_another_rule_format_and_table(database):
+def test_a_manifest_states_shares_and_by_another_rule_a_table(database):
     cases.add_surgeon(database)
     cases.add_demo(database)
     nearest, half = cases.train(database), cases.train(database, learner=HALF)
     for version in (nearest, half):
         with database.reading() as session:
             stored = session.merge(version)
-            share, said = coverage(learnt(stored)).share, stored.manifest["coverage"]
+            share, said = coverage(learnt(stored)).share, stored.manifest.coverage
             assert covered(stored).share.tolist() == share.tolist()
-        assert (said["mean_share"], said["median_share"]) == (share.mean(), np.median(share))
-        assert said["starts_goal_alone"] == (share == 0).sum()
-    assert not {"format", "joining"} & set(nearest.manifest)
-    assert nearest.manifest["settings"]["join_share"] == 0
-    assert half.manifest["format"] == 2
-    waypoints = half.manifest["waypoints"]
-    joined = half.manifest["joining"]
+        assert (said.mean_share, said.median_share) == (share.mean(), np.median(share))
+        assert said.starts_goal_alone == (share == 0).sum()
+    assert nearest.manifest.joining is None
+    assert nearest.manifest.settings["join_share"] == 0
+    waypoints = half.manifest.waypoints
+    joined = half.manifest.joining
     first = waypoints[: len(waypoints) // 2]  # ten states, nine moves: five of them with at least half left
-    assert joined["join_share"] == half.manifest["settings"]["join_share"] == 0.5
-    assert {*zip(joined["states"], joined["phases"], strict=True)} == {(s, first.index(s) + 1) for s in first}
+    assert joined.join_share == half.manifest.settings["join_share"] == 0.5
+    assert {*zip(joined.states, joined.phases, strict=True)} == {(s, first.index(s) + 1) for s in first}
 
 
 def test_a_batch_keeps_the_rule_of_each_style_unless_it_names_a_learner(database):
@@ -119,13 +119,13 @@ def test_a_batch_keeps_the_rule_of_each_style_unless_it_names_a_learner(database
     finish(database, job)
     kept = {style.demonstration.surgeon.slug: style.policy for style in styles_of(database, job)}
     assert kept["kestrel"].sha256 == half.sha256, "the same version, by its rule"
-    assert kept["osprey"].manifest["settings"]["join_share"] == 0
+    assert kept["osprey"].manifest.settings["join_share"] == 0
     named = ask_retraining(database, learner=PhaseQLearning(), release=True)
     finish(database, named)
     (style,) = [one for one in styles_of(database, named) if one.demonstration.surgeon.slug == "kestrel"]
-    assert style.policy.manifest["settings"]["join_share"] == 0
-    assert any("of the demonstration on average" in why for why in style.comparison["worse_because"])
-    assert not style.comparison["now_released"]
+    assert style.policy.manifest.settings["join_share"] == 0
+    assert any("of the demonstration on average" in why for why in style.comparison.worse_because)
+    assert not style.comparison.now_released
 
 
 def finish(database, job):

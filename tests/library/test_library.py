@@ -24,11 +24,12 @@ from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.library import perform as library
 from skills.library.operation import jobs, styles
+from skills.library.operation.integrity import learnt
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies import releases
-from skills.library.policies.versions import learnt, policy_of
+from skills.library.policies.versions import policy_of
 from skills.library.recordings.demos import add_demo, find_demo, withdraw_demo
 from skills.library.recordings.recordings import recording_bytes, store_recording
 from skills.schemas.demos import DemoIn
@@ -120,9 +121,9 @@ def test_hysteresis_is_kept_with_the_path_and_learnt_and_planned_with(database: 
     lost_mm = tuple(discretisation_rmse(tip_mm, PAPER_GRID, 0.25))
     assert demo.report.discretisation_rmse_mm == lost_mm != plain.report.discretisation_rmse_mm
     version = cases.train(database, demos=[demo.sha256], release=True)
-    assert version.manifest["metrics"]["discretisation_rmse_mm"] == list(lost_mm)
-    assert version.manifest["metrics"]["exact_states"] == len(path.states)
-    assert cases.add_plan(database).about["path"] == "fitted"
+    assert version.manifest.metrics.discretisation_rmse_mm == tuple(lost_mm)
+    assert version.manifest.metrics.exact_states == len(path.states)
+    assert cases.add_plan(database).about.path == "fitted"
 
 
 def test_a_hysteresis_that_cannot_be_meant_leaves_no_row(database: Database):
@@ -264,15 +265,15 @@ def test_the_first_page_shows_what_the_manifest_states(database: Database):
     cases.train(database)
     with database.reading() as session:
         manifest = session.scalars(select(PolicyVersion.manifest)).one()
-        assert tile(session) == (manifest["waypoints"], pytest.approx(manifest["coverage"]["mean_share"]))
+        assert tile(session) == (manifest.waypoints, pytest.approx(manifest.coverage.mean_share))
 
 
 def tile(session: Session) -> tuple[list[int], float]:
     ((_, listed),) = styles.matrix(session).rows
     shown = next(style.shown for style in listed if style.shown is not None)
     manifest = session.scalars(select(PolicyVersion.manifest)).one()
-    assert shown.grid_shape == tuple(manifest["grid"]["shape"])
-    assert shown.dtw_total_mm == pytest.approx(manifest["metrics"]["dtw_total_mm"])
+    assert shown.grid_shape == manifest.grid.shape
+    assert shown.dtw_total_mm == pytest.approx(manifest.metrics.dtw_total_mm)
     return shown.waypoints, shown.mean_share
 
 
@@ -280,8 +281,8 @@ def test_what_value_iteration_finds_may_be_released(database: Database):
     cases.add_demo(database)
     version = cases.train(database, learner=ValueIteration())
     assert version.releasable
-    assert version.manifest["learner"] == "value-iteration"
-    assert version.manifest["metrics"]["dtw_total_mm"] == 0
+    assert version.manifest.learner == "value-iteration"
+    assert version.manifest.metrics.dtw_total_mm == 0
     with database.writing() as session:
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
     with database.reading() as session:

@@ -20,7 +20,7 @@ from skills.library.operation.erasure_list import keep_up_erasures, read_erasure
 from skills.library.people.erasure import delete_recording, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job
-from skills.library.policies.releases import release, standing
+from skills.library.policies.releases import in_force, release
 from skills.library.policies.training import request_training, train_style
 from skills.library.policies.versions import find_version
 from skills.library.recordings.demos import add_demo
@@ -97,7 +97,7 @@ def served(database: Database) -> list[int]:
     """Return the versions of kestrel's releases that stand, the served one first."""
     with database.reading() as session:
         row = session.scalars(select(Surgeon.row).where(Surgeon.slug == "kestrel")).one()
-        return [one.policy.version for one in standing(session, row, cases.SUTURE)]
+        return [one.policy.version for one in in_force(session, row, cases.SUTURE)]
 
 
 def counts(database: Database, *tables: type) -> list[int]:

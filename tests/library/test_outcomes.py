@@ -22,12 +22,14 @@ from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
-from skills.library.policies.releases import release, remedy, standing
+from skills.library.policies.gate import remedy
+from skills.library.policies.releases import in_force, release
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.demos import OutcomeIn
+from skills.schemas.policies import GateRefusal
 from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
@@ -50,7 +52,7 @@ def served(database: Database) -> list[int]:
     """Return the versions of all releases that stand, the newest first."""
     with database.reading() as session:
         (surgeon,) = session.scalars(select(Demonstration.surgeon_row).distinct())
-        return [one.policy.version for one in standing(session, surgeon, cases.SUTURE)]
+        return [one.policy.version for one in in_force(session, surgeon, cases.SUTURE)]
 
 
 def release_again(database: Database, version: PolicyVersion) -> None:
@@ -183,11 +185,11 @@ def test_a_policy_of_any_outcome_names_the_outcomes(database: Database):
     mark(database, bad, "failure")
     demos = [one.sha256 for one in (bad, unknown, good)]
     version = cases.train(database, demos=demos, outcomes="any", release=True)
-    assert version.manifest["outcomes"] == ["success", "failure", None]
+    assert version.manifest.outcomes == ["success", "failure", None]
     alone = cases.train(database, outcomes="any", demos=[unknown.sha256])
-    assert alone.manifest["outcomes"] == [None]
+    assert alone.manifest.outcomes == [None]
     with database.reading() as session:
-        card = card_of(session, find_by_digest(session, version.sha256)).written()
+        card = card_of(session, find_by_digest(session, version.sha256)).facts.model_dump()
     assert "that of its demonstrations was: success, failure, not known." in card["learner"]["in_words"]
     assert [one["outcome"] for one in card["demonstrations"]] == ["success", "failure", None]
     assert card["demonstrations"][1]["state_in_words"] == f"Active. Marked failure: {WHY}"
@@ -197,7 +199,9 @@ def test_a_policy_of_any_outcome_names_the_outcomes(database: Database):
 def test_a_card_states_outcomes_and_of_an_unmarked_demonstration_none(database: Database):
     def learner() -> str:
         with database.reading() as session:
-            return str(card_of(session, find_by_digest(session, version.sha256)).written()["learner"]["in_words"])
+            return str(
+                card_of(session, find_by_digest(session, version.sha256)).facts.model_dump()["learner"]["in_words"]
+            )
 
     demo = add(database)
     version = cases.train(database)
@@ -214,7 +218,7 @@ def test_a_card_states_the_samples_that_were_dropped(database: Database):
     sound = add(database, 1.0)
     version = cases.train(database, demos=[demo.sha256, sound.sha256], combine=Medoid())
     with database.reading() as session:
-        card = card_of(session, find_by_digest(session, version.sha256)).written()
+        card = card_of(session, find_by_digest(session, version.sha256)).facts.model_dump()
     said, none = (one["quality_in_words"] for one in card["demonstrations"])
     assert said[1] == (
         "Samples dropped from the whole recording: 1 for repeating a stamp, 1 for a stamp that went back."
@@ -237,7 +241,8 @@ def test_a_mark_withdraws_the_releases_that_rest_on_it(database: Database, outco
     assert served(database) == []  # the one before does not come back by itself
     with pytest.raises(Conflict, match=f"its demonstration was marked {outcome}") as refused:
         release_again(database, version)
-    assert remedy(refused.value.words()).startswith("Train from another demonstration, or with outcomes 'any'")
+    assert "was marked" in refused.value.message
+    assert remedy([GateRefusal("marked", "")]).startswith("Train from another demonstration, or with outcomes 'any'")
     assert wrong(database) == []
     mark(database, demo, "success", None)
     assert served(database) == []

@@ -17,12 +17,14 @@ from skills.library.operation.jobs import cancel
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans import playbacks
 from skills.library.plans.plans import trajectory_of
+from skills.library.plans.playback_pictures import draw_pictures, find_pictures
 from skills.planning.trajectory import time_parametrise
 from skills.settings import Settings
 from skills.simulation import film, pictures
 from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
+from tests.library.verdicts import verdict_on
 from tests.planning.motions import hand_off, ideal_playback
 from tests.planning.test_trajectory import BESIDE
 
@@ -35,8 +37,9 @@ REPORT = {
 
 def store_playback(session: Session, plan: Plan, sha256: str, measured: Playback) -> StoredPlayback:
     """Store a playback and request its pictures, as a worker does with the verdict."""
+    report = verdict_on(plan.sha256, measured.trajectory, measured)
     row = StoredPlayback(
-        sha256=sha256, plan=session.get_one(Plan, plan.row), feasible=True, report=REPORT, measured=measured
+        sha256=sha256, plan=session.get_one(Plan, plan.row), feasible=True, report=report, measured=measured
     )
     session.add(row)
     session.flush()
@@ -67,7 +70,7 @@ def drawn(database: Database) -> list[StoredPictures]:
 
 def refusal(database: Database, playback: StoredPlayback) -> str:
     with database.reading() as session, pytest.raises(NotDrawnYet) as caught:
-        playbacks.find_pictures(session, playback)
+        find_pictures(session, playback)
     return str(caught.value)
 
 
@@ -80,13 +83,13 @@ def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
     monkeypatch.setattr(film, "FRAMES_PER_PASS", 2)
     [job] = asked(database)
     assert job.id in refusal(database, playback)
-    store = playbacks.draw_pictures(database, job.request, Settings(database_url=database.url))
+    store = draw_pictures(database, job.request, Settings(database_url=database.url))
     for _ in range(2):  # the second time by a worker that does not know of the first
         with database.writing() as session:
             assert store(session, "test") == {"playback": playback.sha256}
     assert len(drawn(database)) == 1
     with database.reading() as session:
-        found = playbacks.find_pictures(session, playback)
+        found = find_pictures(session, playback)
     assert found.animation_mp4[4:8] == b"ftyp"
     assert found.animation_gif.startswith(b"GIF89a")
     assert all(png.startswith(b"\x89PNG") for png in (found.joints_png, found.clearance_png))
@@ -133,7 +136,7 @@ def test_they_are_erased_with_what_they_show(database: Database, playback: Store
         if what == "surgeon":
             dropped = erase_surgeon(session, "kestrel", "test")
         else:
-            dropped = erase_demo(session, playback.plan.policy.manifest["demos"][0], "test")
+            dropped = erase_demo(session, playback.plan.policy.manifest.demos[0], "test")
     assert unfinished and set(unfinished) <= set(dropped)
     assert drawn(database) == asked(database) == []
 

@@ -1,44 +1,54 @@
 """Headlines of plans: they name omissions, and are green only if the hand-over is probable enough."""
 
-import json
-from dataclasses import asdict
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from skills.library.plans.plans import hands_over, plan_in_words
-from skills.library.plans.playbacks import CHECK_VERSION, costs_most, headline
-from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
+from skills.gridworld.scene import Scene, Tissue
+from skills.library.plans.description import describe_motion
+from skills.library.plans.headline import CHECK_VERSION, costs_most, headline
+from skills.schemas import plans as schemas
+from skills.schemas.plans import PlanDescription, PlanScene, Timetable
+from skills.schemas.playbacks import Headline
+from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, ArmErrors
 from skills.verification.monte_carlo import estimate_success
-from skills.verification.probabilities import JUDGE_VERSION, EstimateSettings
+from skills.verification.probabilities import JUDGE_VERSION, Cost, EstimateSettings, Faults, SuccessEstimate
+from tests.library.verdicts import doubted, of_pass, probability
 from tests.verification.test_monte_carlo import PAD_TOP_MM, motion
 from tests.verification.test_monte_carlo import PSM_M as OTHER_ARM
 
 NAN = float("nan")
-PSM_M = {"approach": [-1.0, 0.0, 0.0]}
-TISSUE = {"scene": {"tissue": {"height_mm": -140.0}}}
-NOW = {"check_version": CHECK_VERSION, "stated_by": "installation"}
-SHIFT = {"suture_point_mm": 5.0}
+PSM_M = schemas.PsmM.model_construct(approach=(-1.0, 0.0, 0.0))
+TISSUE = Scene("PSM1_base", tissue=Tissue.plane((0.0, 0.0, -140.0), (0.0, 0.0, 1.0)))
+NONE = Scene("PSM1_base")
+JUDGED = Faults(place=0, arms=0, pad=0)
 
 
-def about(passes: int = 5, psm_m: dict[str, Any] | None = None, moves: bool = False) -> dict[str, Any]:
-    motion = {"psm_m_moves": moves, "tempo": None}
+def about(passes: int = 5, psm_m: schemas.PsmM | None = None, moves: bool = False) -> PlanDescription:
+    motion = Timetable.model_construct(psm_m_moves=moves, tempo=None)
     hand = {"orientation": "recorded", "departure": None, "a2": None, "scene": None}
-    return {"arm": "PSM1", "passes": [{}] * passes, "psm_m": psm_m, "trajectory": motion} | hand
+    return PlanDescription.model_construct(arm="PSM1", passes=[None] * passes, psm_m=psm_m, trajectory=motion, **hand)
 
 
 FULL = about(psm_m=PSM_M, moves=True)
 
 
-def told(of: dict[str, Any], lower: float | None, count: int = 990, feasible: object = True) -> dict[str, Any]:
-    upper = None if lower is None else min(1.0, count / 1000 + 0.03)
-    whole = {"count": count, "of": 1000, "probability": count / 1000, "lower": lower, "upper": upper}
-    passes = [{"faults": {"place": 0, "arms": 0, "pad": 0}}]
-    under = [{"errors": asdict(CALIBRATED), "plan": whole, "passes": passes}]
-    cost = {"error": "registration_deg", "without": {"count": count + 4, "probability": count / 1000 + 0.004}}
-    judged = {"version": JUDGE_VERSION, "under": under, "costs": [cost], "settings": SHIFT}
-    report = NOW | {"feasible": feasible, "failure_in_words": "Pass 0, A1, sample 3: no.", "doubt": judged}
-    return headline(of, report, errors=CALIBRATED, lower_bound=0.95)
+def shown(scene: Scene, learnt: str | None = None, *differs: str) -> PlanScene:
+    return PlanScene.model_construct(sha256="cd", learnt_sha256=learnt, differs=list(differs), scene=scene)
+
+
+def line_of(of: PlanDescription, doubt: SuccessEstimate, errors: ArmErrors = CALIBRATED, **more: Any) -> Headline:
+    stored = {"check_version": CHECK_VERSION, "stated_by": "installation", "feasible": True, "doubt": doubt}
+    report: Any = SimpleNamespace(**stored | {"failure_in_words": "Pass 0, A1, sample 3: no."} | more)
+    return headline(of, report, errors=errors, lower_bound=0.95)
+
+
+def told(of: PlanDescription, lower: float, count: int = 990, feasible: bool = True) -> Headline:
+    whole = probability(count, lower=lower, upper=min(1.0, count / 1000 + 0.03))
+    cost = Cost("registration_deg", probability(count + 4))
+    return line_of(of, doubted(whole, of_pass(faults=JUDGED), errors=CALIBRATED, cost=cost), feasible=feasible)
 
 
 @pytest.mark.parametrize(
@@ -51,38 +61,35 @@ def told(of: dict[str, Any], lower: float | None, count: int = 990, feasible: ob
     ],
 )
 def test_a_plan_says_what_it_does_and_leaves_out(of: dict[str, Any], words: str):
-    assert words in plan_in_words(of)
-    assert hands_over(of) == (of["psm_m"] is not None)
+    assert words in describe_motion(of)
 
 
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
         (None, "Tissue: not given, so nothing is checked against it, and this motion is not exported."),
-        ({"scene": {"tissue": None}}, "Tissue: not given. It is checked against the stated obstacles, and"),
-        (TISSUE | {"learnt_sha256": None, "differs": []}, "the stated scene, of which its policy knows nothing."),
-        (TISSUE | {"learnt_sha256": "ab", "differs": []}, "the scene of its policy, whose odds hold at the"),
+        (shown(NONE), "Tissue: not given. It is checked against the stated obstacles, and"),
+        (shown(TISSUE), "the stated scene, of which its policy knows nothing."),
+        (shown(TISSUE, "ab"), "the scene of its policy, whose odds hold at the"),
         (
-            TISSUE | {"learnt_sha256": "ab", "differs": ["box 0 is new", "c"]},
+            shown(TISSUE, "ab", "box 0 is new", "c"),
             "the one that its policy was learnt in: box 0 is new, c",
         ),
     ],
 )
-def test_a_plan_and_its_verdict_say_which_scene_was_checked(scene: dict[str, Any] | None, words: str):
-    of = FULL | {"scene": scene}
-    assert words in plan_in_words(of)
-    assert words in told(of, 0.98)["text"]
+def test_a_plan_and_its_verdict_say_which_scene_was_checked(scene: PlanScene | None, words: str):
+    of = FULL.model_copy(update={"scene": scene})
+    assert words in describe_motion(of)
+    assert words in told(of, 0.98).text
 
 
 def test_a_plan_that_hands_over_and_succeeds_surely_is_good():
     line = told(FULL, 0.98)
-    assert (line["level"], line["word"]) == ("good", "Likely to succeed")
-    assert "in 990 of 1000 worlds: 99.0 % (98.0 % to 100.0 %, 95 %)" in line["text"]
-    assert "with the errors of a calibrated arm the complete plan" in line["text"]
-    assert line["costs_most"] in line["text"]
-    assert (
-        line["costs_most"] == "Most is lost by the rotation of PSM_M's base: without it 99.4 % of the worlds succeed."
-    )
+    assert (line.level, line.word) == ("good", "Likely to succeed")
+    assert "in 990 of 1000 worlds: 99.0 % (98.0 % to 100.0 %, 95 %)" in line.text
+    assert "with the errors of a calibrated arm the complete plan" in line.text
+    assert line.costs_most in line.text
+    assert line.costs_most == "Most is lost by the rotation of PSM_M's base: without it 99.4 % of the worlds succeed."
 
 
 @pytest.mark.parametrize(
@@ -94,16 +101,14 @@ def test_a_plan_that_hands_over_and_succeeds_surely_is_good():
         (about(), 0.99, 995, True, "caution", "No hand-off"),
         (about(2, PSM_M), 0.99, 995, True, "caution", "Incomplete"),
         (FULL, 0.99, 995, False, "bad", "Not feasible"),
-        (FULL, 0.99, 995, None, "bad", "Not feasible"),
-        (FULL, None, 995, True, "caution", "Uncertain"),
         (FULL, NAN, 995, True, "caution", "Uncertain"),
     ],
 )
 def test_nothing_else_is_good(of, lower, count, feasible, level, word):
     line = told(of, lower, count, feasible)
-    assert (line["level"], line["word"]) == (level, word)
-    assert line["text"].startswith(f"{word}: ")
-    assert plan_in_words(of) in line["text"]
+    assert (line.level, line.word) == (level, word)
+    assert line.text.startswith(f"{word}: ")
+    assert describe_motion(of) in line.text
 
 
 @pytest.mark.parametrize(
@@ -121,25 +126,21 @@ def test_odds_count_what_was_judged_and_name_what_was_not(trajectory, pad_top_mm
     found = estimate_success(
         trajectory, approach_m=OTHER_ARM.approach, pad_top_mm=pad_top_mm, errors=UNCALIBRATED, settings=settings
     )
-    report = NOW | {"feasible": True, "doubt": json.loads(json.dumps(asdict(found)))}
-    line = headline(FULL if counts == "hand-over" else about(1), report, errors=UNCALIBRATED, lower_bound=0.95)
+    line = line_of(FULL if counts == "hand-over" else about(1), found, UNCALIBRATED)
     always = "how exactly the tip meets its points"
-    assert (line["counts"], line["not_judged"]) == (counts, [*left_out, always])
-    assert ("the complete plan succeeds in" in line["text"]) == (counts == "hand-over")
-    assert ("the motion stays within reach and clear in" in line["text"]) == (counts == "clearance")
-    assert ("Not judged:" in line["text"]) == bool(left_out)
+    assert (line.counts, line.not_judged) == (counts, [*left_out, always])
+    assert ("the complete plan succeeds in" in line.text) == (counts == "hand-over")
+    assert ("the motion stays within reach and clear in" in line.text) == (counts == "clearance")
+    assert ("Not judged:" in line.text) == bool(left_out)
     if left_out:
-        assert f"Not judged: {', '.join(left_out)}, {always}." in line["text"]
+        assert f"Not judged: {', '.join(left_out)}, {always}." in line.text
 
 
 def test_without_a_hand_off_no_error_is_said_to_cost_success():
-    whole = {"count": 20, "of": 20, "probability": 1.0, "lower": 0.9, "upper": 1.0}
-    passes = [{"faults": {"reach": 0, "limits": 0, "pad": 0, "arms": None, "place": None}}]
-    under = {"errors": asdict(CALIBRATED), "plan": whole | {"count": 15, "probability": 0.75}, "passes": passes}
-    cost = {"error": "tip_bias_mm", "without": whole}
-    report = NOW | {"feasible": True, "doubt": {"version": JUDGE_VERSION, "under": [under], "costs": [cost]}}
-    line = headline(about(1), report, errors=CALIBRATED, lower_bound=0.95)
-    assert line["costs_most"].endswith("without it 100.0 % of the worlds stay clear.")
+    cost = Cost("tip_bias_mm", probability(20, 20))
+    found = doubted(probability(15, 20), of_pass(faults=Faults(reach=0, limits=0, pad=0)), errors=CALIBRATED, cost=cost)
+    most = line_of(about(1), found).costs_most
+    assert most is not None and most.endswith("without it 100.0 % of the worlds stay clear.")
 
 
 @pytest.mark.parametrize(
@@ -157,23 +158,18 @@ def test_without_a_hand_off_no_error_is_said_to_cost_success():
     ],
 )
 def test_what_lowers_a_probability_is_named_also_if_it_is_no_arm_error(count, without, shift_mm, words):
-    def some(count: int) -> dict[str, Any]:
-        return {"count": count, "of": 20, "probability": count / 20, "lower": 0.5, "upper": 1.0}
-
-    under = {"errors": asdict(CALIBRATED), "plan": some(count), "passes": [{"faults": {"place": None}}]}
-    costs = [{"error": "tip_bias_mm", "without": some(without)}]
-    settings = {"suture_point_mm": shift_mm}
-    report = {"doubt": {"version": JUDGE_VERSION, "under": [under], "costs": costs, "settings": settings}}
+    settings = EstimateSettings(suture_point_mm=shift_mm)
+    cost = Cost("tip_bias_mm", probability(without, 20))
+    report: Any = SimpleNamespace(doubt=doubted(probability(count, 20), of_pass(), cost=cost, settings=settings))
     assert words in (costs_most(report) or "")
 
 
 def test_an_error_that_was_not_judged_is_said_and_not_good():
-    whole = {"count": 999, "of": 1000, "probability": 0.999, "lower": 0.99, "upper": 1.0}
-    under = {"errors": asdict(CALIBRATED), "plan": whole, "passes": []}
-    other = {"version": JUDGE_VERSION, "under": [under], "costs": []}
+    whole = probability(999, lower=0.99)
+    other = doubted(whole, errors=CALIBRATED)
     another = "judged by another version of the checks; play it again."
-    for doubted, check, words in (
-        (other | {"version": JUDGE_VERSION - 1}, CHECK_VERSION, another),
+    for found, check, words in (
+        (replace(other, version=JUDGE_VERSION - 1), CHECK_VERSION, another),
         (other, CHECK_VERSION - 1, another),
         (
             other,
@@ -181,11 +177,8 @@ def test_an_error_that_was_not_judged_is_said_and_not_good():
             "with the errors of a calibrated arm, which the installation stated then; now it states",
         ),
     ):
-        report = NOW | {"feasible": True, "doubt": doubted, "check_version": check}
-        line = headline(FULL, report, errors=UNCALIBRATED, lower_bound=0.95)
-        assert (line["level"], line["probability"], line["costs_most"]) == ("caution", None, None)
-        assert words in line["text"]
-    line = headline(
-        FULL, NOW | {"feasible": True, "doubt": other, "stated_by": "request"}, errors=UNCALIBRATED, lower_bound=0.95
-    )
-    assert (line["level"], line["errors"]) == ("good", "calibrated")
+        line = line_of(FULL, found, UNCALIBRATED, check_version=check)
+        assert (line.level, line.probability, line.costs_most) == ("caution", None, None)
+        assert words in line.text
+    line = line_of(FULL, other, UNCALIBRATED, stated_by="request")
+    assert (line.level, line.errors) == ("good", "calibrated")

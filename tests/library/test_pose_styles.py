@@ -15,19 +15,18 @@ from skills.demonstration.motion import Motion, Signal
 from skills.demonstration.partner import PartnerMotion
 from skills.demonstration.recording import Recording
 from skills.errors import Busy, Corrupt, NotFound
-from skills.formats import write_mcap
+from skills.formats.bag_writer import write_mcap
 from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import HISTORY, inspect_installation
 from skills.library.people.erasure import erase_demo
 from skills.library.people.surgeons import put_surgeon
-from skills.library.policies import training
+from skills.library.policies import learning, training
 from skills.library.policies.batches import retrain_part
-from skills.library.policies.versions import poses_of
+from skills.library.policies.pose_styles import poses_of
 from skills.library.recordings.demos import withdraw_demo
 from skills.remedies import Remedy
-from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
@@ -138,7 +137,7 @@ def test_several_demonstrations_give_one_pose_style_at_one_place(database: Datab
     version = cases.train(database, demos=[one.sha256 for one in demos])
     with database.reading() as session:
         version = session.get_one(PolicyVersion, version.row)
-        poses, at = poses_of(version), version.manifest["combined"]["at"]
+        poses, at = poses_of(version), version.manifest.combined.at
         (place,) = [one.demo for one in version.demonstrations if one.sha256 == at]
     assert np.abs(poses.path.tip_mm[[0, -1]] - place.tip_mm[[0, -1]]).max() < 1e-9
     assert poses.path.spread_mm.max() > 0.0
@@ -236,7 +235,7 @@ def test_a_batch_tries_a_style_again_whose_recording_cannot_be_read_now(
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
     with monkeypatch.context() as now:
-        now.setattr(training, "stored_recording", busy)
+        now.setattr(learning, "stored_recording", busy)
         with pytest.raises(Busy):
             retrain_part(database, part.request, Settings(database_url=database.url))
     assert states_of(database, job) == ["queued"]
@@ -263,7 +262,7 @@ def test_a_recording_that_is_not_cached_is_read_again(database: Database):
 def test_no_recording_is_read_where_the_other_arm_is_not_known(database: Database, monkeypatch: pytest.MonkeyPatch):
     cases.add_surgeon(database)
     add(database, turning())
-    monkeypatch.setattr(training, "stored_recording", lambda *_: pytest.fail("it was read"))
+    monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     assert beside(database, cases.train(database)) is None
 
 
@@ -272,8 +271,8 @@ def test_no_recording_is_read_without_consent(database: Database, monkeypatch: p
     add_both(database)
     job = cases.ask_training(database)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
-    monkeypatch.setattr(training, "stored_recording", lambda *_: pytest.fail("it was read"))
+        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+    monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     ended = cases.work(database, job)
     assert ended.state == "failed" and "consent" in (ended.error or "")
 

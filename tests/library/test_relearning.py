@@ -24,10 +24,11 @@ from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation import inspection
 from skills.library.operation.inspection import Checked, inspect_policies
 from skills.library.operation.integrity import demo_identity, poses_identity_of
+from skills.library.policies.gate import GATE_VERSION
+from skills.library.policies.learning import certified, lessons
 from skills.library.policies.relearning import compute_again, decoded
-from skills.library.policies.training import GATE_VERSION, certified, lessons
 from skills.library.recordings.demos import mark_demo
-from skills.schemas.policy_document import policy_identity
+from skills.schemas.policies import PolicyManifest
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
@@ -101,9 +102,9 @@ def test_with_a_limit_some_are_learnt_again_and_the_others_certified(database):
     }
 
 
-def rewritten(database: Database, row: int, policy: Any, manifest: dict[str, Any]) -> None:
+def rewritten(database: Database, row: int, policy: Any, manifest: PolicyManifest) -> None:
     """Write a policy and a manifest with the digest of both, past the triggers."""
-    value = {"learnt": policy, "manifest": manifest, "sha256": policy_identity(manifest, policy)}
+    value = {"learnt": policy, "manifest": manifest, "sha256": manifest.identity(digest(policy))}
     with tampering(database) as connection:
         connection.execute(update(PolicyVersion).where(PolicyVersion.row == row).values(**value))
         connection.commit()
@@ -113,8 +114,8 @@ def test_a_certificate_with_better_figures_and_its_digest_is_named(database):
     with database.reading() as session:
         version = session.get_one(PolicyVersion, 2)
         policy, manifest = version.learnt, version.manifest
-    metrics = manifest["metrics"] | dict.fromkeys(manifest["metrics"], 0.0)
-    rewritten(database, 2, policy, manifest | {"metrics": metrics})
+    metrics = replace(manifest.metrics, dtw_total_mm=1.5, rmse_mm=(0.5, 0.5, 0.5))
+    rewritten(database, 2, policy, manifest.model_copy(update={"metrics": metrics}))
     for how in (RELEARN, None):
         ((name, why),) = [one for part in parts(database, relearn=how).values() for one in part.wrong]
         assert name == "policy_versions 2"
@@ -173,9 +174,9 @@ def test_another_motion_of_the_other_arm_with_its_digest_is_named(tmp_path: Path
     database.close()
 
 
-def _request(manifest: dict[str, Any]) -> dict[str, Any]:
+def _request(manifest: PolicyManifest) -> dict[str, Any]:
     names = ("surgeon", "suture", "demos", "seed", "learner_version")
-    return {name: manifest[name] for name in names} | {"gate": GATE_VERSION, "near": asdict(NearLimits())}
+    return {name: getattr(manifest, name) for name in names} | {"gate": GATE_VERSION, "near": asdict(NearLimits())}
 
 
 def test_a_demonstration_other_than_its_recording_is_named(database):
@@ -195,7 +196,7 @@ def test_a_demonstration_other_than_its_recording_is_named(database):
 def test_a_version_of_an_older_learner_is_never_called_whole(database):
     with database.reading() as session:
         version = session.get_one(PolicyVersion, 1)
-        policy, manifest = version.learnt, version.manifest | {"learner_version": LEARNER_VERSION - 1}
+        policy, manifest = version.learnt, version.manifest.model_copy(update={"learner_version": LEARNER_VERSION - 1})
     rewritten(database, 1, policy, manifest)
     made = f"made by an older learner (version {LEARNER_VERSION - 1}, now {LEARNER_VERSION})"
     found = parts(database)
@@ -208,13 +209,13 @@ def test_of_an_older_gate_only_the_values_are_compared(database):
     with database.reading() as session:
         version = session.get_one(PolicyVersion, 1)
         policy, manifest = version.learnt, version.manifest
-    certificate = manifest["grid_certificate"] | {"gate": GATE_VERSION - 1}
-    rewritten(database, 1, policy, manifest | {"grid_certificate": certificate})
+    older = {"grid_certificate": replace(manifest.grid_certificate, gate=GATE_VERSION - 1)}
+    rewritten(database, 1, policy, manifest.model_copy(update=older))
     part = parts(database)[RELEARNT]
     assert part.wrong == []
     ((_, why),) = part.left_out
     assert why.endswith("only its values were compared")
-    rewritten(database, 1, replace(policy, q=policy.q * 2.0), manifest | {"grid_certificate": certificate})
+    rewritten(database, 1, replace(policy, q=policy.q * 2.0), manifest.model_copy(update=older))
     assert "its values" in str(parts(database)[RELEARNT].wrong)
 
 

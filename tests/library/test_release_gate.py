@@ -23,7 +23,8 @@ from skills.learning.certificate import NearLimits, certify, near_starts
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.library.policies import releases, retraining, training
+from skills.library.policies import gate, learning, releases, retraining, training
+from skills.schemas.policies import GateRefusal
 from tests.formats.bags import sample_folder
 from tests.gridworld.paths import learnt
 from tests.library import cases
@@ -56,10 +57,10 @@ def trained(database, data: bytes, **how):
 def test_a_real_bag_whose_samples_are_all_within_the_limits_is_released(database):
     data = (sample_folder() / "rosbag2" / "rosbag2.mcap").read_bytes()
     version = trained(database, data, vouched=True)
-    assert version.manifest["grid_certificate"]["refused_because"] == []
-    driven = version.manifest["grid_certificate"]["driven"]
-    assert (driven["path"], driven["frame"], driven["beyond"]) == ("fitted", "PSM2_base", 0)
-    assert driven["cell_centres_beyond"] == 1  # reported, because a rollout names them; no arm follows them in a plan
+    assert version.manifest.grid_certificate.refused_because == ()
+    driven = version.manifest.grid_certificate.driven
+    assert (driven.path, driven.frame, driven.beyond) == ("fitted", "PSM2_base", 0)
+    assert driven.cell_centres_beyond == 1  # reported, because a rollout names them; no arm follows them in a plan
     with database.writing() as session:
         releases.release(session, session.merge(version), "test")
 
@@ -67,25 +68,25 @@ def test_a_real_bag_whose_samples_are_all_within_the_limits_is_released(database
 def test_a_pass_within_limits_is_accepted_despite_cell_centres_beyond_them(database):
     assert pitch_rad((0, 135, Z_MM)) < LIMIT_RAD < pitch_rad((0, 135, -110))
     version = trained(database, reaching(135))
-    certificate = version.manifest["grid_certificate"]
-    assert certificate["refused_because"] == []
-    assert certificate["driven"]["cell_centres_beyond"] > 0
-    nearest = certificate["driven"]["nearest_limit"]
-    assert (nearest["joint"], nearest["unit"], nearest["limit"]) == ("pitch", "rad", pytest.approx(-LIMIT_RAD))
-    assert nearest["margin"] == pytest.approx(LIMIT_RAD - pitch_rad(nearest["tip_mm"]), abs=1e-9)
-    assert nearest["margin"] == pytest.approx(LIMIT_RAD - pitch_rad((0, 135, Z_MM)), abs=radians(0.3))
+    certificate = version.manifest.grid_certificate
+    assert certificate.refused_because == ()
+    assert certificate.driven.cell_centres_beyond > 0
+    nearest = certificate.driven.nearest_limit
+    assert (nearest.joint, nearest.unit, nearest.limit) == ("pitch", "rad", pytest.approx(-LIMIT_RAD))
+    assert nearest.margin == pytest.approx(LIMIT_RAD - pitch_rad(nearest.tip_mm), abs=1e-9)
+    assert nearest.margin == pytest.approx(LIMIT_RAD - pitch_rad((0, 135, Z_MM)), abs=radians(0.3))
 
 
 def test_a_pass_beyond_a_limit_is_refused_with_place_joint_and_amount(database):
     version = trained(database, reaching(138.5))
-    certificate = version.manifest["grid_certificate"]
-    nearest = certificate["driven"]["nearest_limit"]
-    np.testing.assert_allclose(nearest["tip_mm"], (0, 138.5, Z_MM), atol=1.0)  # mm
-    beyond = pitch_rad(nearest["tip_mm"]) - LIMIT_RAD
-    assert nearest["margin"] == pytest.approx(-beyond, abs=1e-9)
+    certificate = version.manifest.grid_certificate
+    nearest = certificate.driven.nearest_limit
+    np.testing.assert_allclose(nearest.tip_mm, (0, 138.5, Z_MM), atol=1.0)  # mm
+    beyond = pitch_rad(nearest.tip_mm) - LIMIT_RAD
+    assert nearest.margin == pytest.approx(-beyond, abs=1e-9)
     assert 0.001 < beyond < 0.006  # by hand: 53.28 degrees at the corner
-    (reason,) = certificate["refused_because"]
-    x, y, z = nearest["tip_mm"]
+    (reason,) = texts(certificate.refused_because)
+    x, y, z = nearest.tip_mm
     assert f"({x:.1f}, {y:.1f}, {z:.1f}) mm in PSM2_base" in reason
     assert f"pitch -{LIMIT_RAD + beyond:.4f} rad, {beyond:.4f} rad beyond" in reason
     assert "fitted path" in reason
@@ -120,9 +121,9 @@ def test_poses_in_a_cameras_frame_are_released_if_joints_show_the_base(database,
     seen = Motion("PSM2", "/PSM2/measured_cp", "ECM", stamps_ns, tip_mm @ turn.T + [50.0, 0.0, 120.0], rotation)
     data = write_mcap(Recording("mcap", "full", (seen,), joints=(joints,)))
     version = trained(database, data)
-    assert (version.manifest["frame"], version.manifest["instrument"]) == ("PSM2_base", instrument)
-    assert version.manifest["grid_certificate"]["refused_because"] == []
-    np.testing.assert_allclose(version.manifest["start_mm"], (-10.0, 55.0, -135.0), atol=1e-3)
+    assert (version.manifest.frame, version.manifest.instrument) == ("PSM2_base", instrument)
+    assert version.manifest.grid_certificate.refused_because == ()
+    np.testing.assert_allclose(version.manifest.start_mm, (-10.0, 55.0, -135.0), atol=1e-3)
     with database.writing() as session:
         releases.release(session, session.merge(version), "test")
 
@@ -131,17 +132,21 @@ def test_an_instrument_without_constants_is_named_and_not_released(database):
     (motion,) = read_recording(io.BytesIO(cases.bag())).motions
     named = Recording("mcap", "full", (motion,), tools=(("PSM2", "MEGA_NEEDLE_DRIVER:400194"),))
     version = trained(database, write_mcap(named))
-    assert version.manifest["instrument"] == "400194"
-    (reason,) = version.manifest["grid_certificate"]["refused_because"]
+    assert version.manifest.instrument == "400194"
+    (reason,) = texts(version.manifest.grid_certificate.refused_because)
     assert "'400194' is unknown" in reason
     assert not version.releasable
 
 
-def reasons(policy: Policy) -> list[str]:
+def texts(refusals) -> list[str]:
+    return [one.text for one in refusals]
+
+
+def reasons(policy: Policy) -> list[GateRefusal]:
     """Return the reasons on the grid against a release of a policy."""
     certificate, covered = certify(policy)
     assert covered.share is not None
-    return releases.refusals(policy, certificate, near_starts(policy, covered.share, NearLimits(least_share=0.0)))
+    return gate.refusals(policy, certificate, near_starts(policy, covered.share, NearLimits(least_share=0.0)))
 
 
 @pytest.mark.parametrize(
@@ -154,9 +159,10 @@ def test_values_too_small_to_be_learnt_are_refused_with_a_gamma_that_does(learne
     reward = sparse_reward(GridPath(grid, grid.states_of([[448, 1, 1], [449, 1, 1]])))
     policy = replace(learn_tabular(reward, learner), ties=None)  # the rule among ties would lead the nearest way here
     certificate, _ = certify(policy)
-    reason = reasons(policy)[1]
+    refusal = reasons(policy)[1]
+    reason = refusal.text
     assert reason.startswith(f"{certificate.faint} of them are so far from the path that their values, with gamma 0.1,")
-    assert "larger cells" in releases.remedy(reason)
+    assert "larger cells" in gate.remedy([refusal])
     better = learn_tabular(reward, replace(learner, gamma=float(reason.rpartition(" gamma of ")[2])))
     assert reasons(better) == []
 
@@ -174,13 +180,13 @@ def test_a_rollout_that_is_not_the_demonstration_is_a_reason_of_its_own():
     q = policy.q.copy()
     q[policy.row(1, policy.path.start), STAY] = 100
     still = replace(policy, q=q)
-    assert "the rollout from the demonstrated start is not the demonstration" in reasons(still)
+    assert "the rollout from the demonstrated start is not the demonstration" in texts(reasons(still))
     certificate, covered = certify(policy)
     near = near_starts(policy, covered.share, NearLimits())
-    assert releases.refusals(policy, certificate, near) == []
+    assert gate.refusals(policy, certificate, near) == []
     unlike = replace(certificate, demonstration_reproduced=False)
-    assert len(releases.refusals(policy, unlike, near)) == 1
-    assert releases.refusals(learnt("an angle", phased=False), unlike, replace(near, share=0.0)) == []
+    assert len(gate.refusals(policy, unlike, near)) == 1
+    assert gate.refusals(learnt("an angle", phased=False), unlike, replace(near, share=0.0)) == []
 
 
 @pytest.mark.parametrize(
@@ -196,9 +202,10 @@ def test_a_rollout_that_is_not_the_demonstration_is_a_reason_of_its_own():
 def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, margin, words, path, way, monkeypatch):
     nearest = SimpleNamespace(tip_mm=(1, 2, 3), joint="pitch", unit="rad", limit=-0.8, value=value, margin=margin)
     driven = SimpleNamespace(beyond=2, samples=9, path=path, nearest_limit=nearest)
-    monkeypatch.setattr(releases, "driven_pass", lambda _policy, _demo: driven)
+    monkeypatch.setattr(gate, "driven_pass", lambda _policy, _demo: driven)
     demo = SimpleNamespace(frame="PSM2_base", instrument="400006")
-    found, (reason,) = releases.driven_or_refused(learnt("an angle"), demo)
+    found, refused = gate.driven_or_refused(learnt("an angle"), demo)
+    (reason,) = texts(refused)
     assert found is driven
     assert f"at (1.0, 2.0, 3.0) mm in PSM2_base {words}" in reason
     assert way in reason and "of 2 of 9 places" in reason
@@ -206,18 +213,18 @@ def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, marg
 
 def test_a_pass_that_cannot_be_checked_is_refused(monkeypatch):
     policy, demo = learnt("an angle"), SimpleNamespace(frame="PSM2_base", instrument="400006")
-    found, (reason,) = releases.driven_or_refused(policy, SimpleNamespace(frame="ECM"))
-    assert found is None and "'ECM' is not the arm's base" in reason
+    found, (refused,) = gate.driven_or_refused(policy, SimpleNamespace(frame="ECM"))
+    assert found is None and "'ECM' is not the arm's base" in refused.text
     within = SimpleNamespace(beyond=0)
-    monkeypatch.setattr(releases, "driven_pass", lambda _policy, _demo: within)
-    assert releases.driven_or_refused(policy, demo) == (within, [])
+    monkeypatch.setattr(gate, "driven_pass", lambda _policy, _demo: within)
+    assert gate.driven_or_refused(policy, demo) == (within, [])
 
     def refusing(_policy: object, _demo: object) -> None:
         raise BadPlan("It is too short.")
 
-    monkeypatch.setattr(releases, "driven_pass", refusing)
-    found, (reason,) = releases.driven_or_refused(policy, demo)
-    assert found is None and reason.endswith("not checked: It is too short")
+    monkeypatch.setattr(gate, "driven_pass", refusing)
+    found, (refused,) = gate.driven_or_refused(policy, demo)
+    assert found is None and refused.text.endswith("not checked: It is too short")
 
 
 @pytest.mark.parametrize(
@@ -240,9 +247,9 @@ def test_what_changed_during_a_training_forbids_storing_it(demo, others, why, ou
     sound = {"withdrawn_at": None, "outcome": None, "slug": "kestrel", "consent": None}
     first, *rest = (None if one is None else SimpleNamespace(**sound | one) for one in (demo, *others))
     session = SimpleNamespace(get=lambda _kind, row: rest[row])
-    manifest = {} if outcomes == "success" else {"outcomes": "any"}
+    manifest = SimpleNamespace(outcomes=None if outcomes == "success" else [None])
     finished = SimpleNamespace(lesson=SimpleNamespace(others=range(len(rest))), manifest=manifest)
-    refused = training._refusal(session, finished, first)
+    refused = learning._refusal(session, finished, first)
     if why is None or ("marked" in why and outcomes == "any"):
         assert refused is None
     else:

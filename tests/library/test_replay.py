@@ -4,45 +4,50 @@ import io
 import json
 import math
 import zipfile
-from dataclasses import asdict, replace
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic_core import to_jsonable_python
 from sqlalchemy import select, update
 
+from skills.db.leaves import newest_checkpoint
 from skills.db.models import Plan, StoredPlayback
 from skills.db.packed import digest as digest_of
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt, NotFound
 from skills.formats.replay_bag import arms_of
 from skills.formats.verify import check_bag
-from skills.library.operation.history import newest_checkpoint, sign_history
+from skills.library.operation.history import sign_history
+from skills.library.operation.integrity import planned
 from skills.library.people.surgeons import find_surgeon
-from skills.library.plans import replay
-from skills.library.plans.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
-from skills.library.plans.playbacks import CHECK_VERSION
-from skills.library.plans.replay import check_doubt, cleared, replay_bag
+from skills.library.plans import plans, replay
+from skills.library.plans.description import describe_motion
+from skills.library.plans.headline import CHECK_VERSION
+from skills.library.plans.plans import find_plan, plan_sutures, trajectory_of
+from skills.library.plans.replay import replay_bag
+from skills.library.plans.replay_gate import ReplayConditions, check_probability, cleared
 from skills.library.policies import releases
 from skills.library.policies.versions import find_version
 from skills.library.recordings.demos import withdraw_demo
-from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.planning.trajectory import Trajectory
 from skills.schemas.plans import PlanIn
 from skills.transparency.notes import read_notes
 from skills.transparency.signing_keys import PublicKey
-from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, ArmErrors
+from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
 from skills.verification.clearance import psm_m_poses
 from skills.verification.probabilities import JUDGE_VERSION
-from skills.verification.verdict import judge
 from tests.independent_history import check_envelope
 from tests.library import cases
 from tests.library.attacks import tampering
+from tests.library.verdicts import doubt_of, verdict_on
 from tests.planning.motions import ideal_playback
 
 ASKED: dict[str, Any] = {"errors": UNCALIBRATED, "lower_bound": 0.9}
-OF_A1_ALONE: dict[str, Any] = ASKED | {"handoff": "none"}
+OF_A1_ALONE = ReplayConditions(**ASKED, handoff="none")
 
 
 def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str | None = None, **more: Any) -> str:
@@ -54,34 +59,19 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
     if trajectory.psm_m is not None:
         tip_mm, apart_mm = psm_m_poses(trajectory, measured.looked_at)[0], np.full((len(trajectory), 24), 5.0)
         measured = replace(measured, psm_m_tip_mm=tip_mm, clearances_mm=apart_mm)
-    arms = {"arms": [asdict(one) for one in judge(measured, trajectory).arms]}
-    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of(trajectory)}
-    report = json.loads(canonical(told | arms | doubt(0.97) | more))
-    identity = digest or sha256(canonical([plan.sha256, report]))
+    chosen = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of(trajectory)} | more
+    report = verdict_on(plan.sha256, trajectory, measured, **chosen)
+    identity = digest or report.identity
     with database.writing() as session:
         row = find_plan(session, plan.sha256)
         session.add(StoredPlayback(sha256=identity, plan=row, feasible=feasible, report=report, measured=measured))
     return identity
 
 
-def doubt(*lower: float | None, errors: ArmErrors = UNCALIBRATED, stated_by: str = "installation") -> dict[str, Any]:
-    faults = {"place": None, "arms": None, "pad": 0}  # of a plan without a hand-off
-    passes = [{"succeeds": {"count": 990, "of": 1000, "lower": bound}, "faults": faults} for bound in lower]
-    under = [{"errors": asdict(errors), "passes": passes, "plan": {"count": 700, "of": 1000}}]
-    without = {"count": 880, "probability": 0.88}
-    costs = [{"error": "registration_mm", "without": without}]
-    judged = {"version": JUDGE_VERSION, "under": under, "costs": costs}
-    return {"doubt": judged, "stated_by": stated_by, "check_version": CHECK_VERSION}
-
-
-def of_another_judge(lower: float, version: int) -> dict[str, Any]:
-    judged = doubt(lower)
-    return judged | {"doubt": judged["doubt"] | {"version": version}}
-
-
 def gate(database: Database, plan: Plan, **asked: Any) -> str:
     with database.reading() as session:
-        return cleared(session, find_plan(session, plan.sha256), **(OF_A1_ALONE | asked)).sha256
+        row = find_plan(session, plan.sha256)
+        return cleared(session, row, planned(row), replace(OF_A1_ALONE, **asked)).sha256
 
 
 @pytest.fixture
@@ -106,7 +96,7 @@ def test_a_plan_is_cleared_by_its_own_newest_feasible_playback(database: Databas
     assert gate(database, plan) == first
     newer = judged(database, plan, samples=7)
     assert gate(database, plan) == newer
-    judged(database, plan, **doubt(0.5))
+    judged(database, plan, doubt=doubt_of(0.5))
     with pytest.raises(Conflict, match=r"only 0.500, and 0.9 is required"):
         gate(database, plan)
     gate(database, plan, lower_bound=0.5)
@@ -141,7 +131,7 @@ def test_a_motion_that_was_compared_with_no_tissue_is_not_exported(database: Dat
     judged(database, without)
     with pytest.raises(Conflict, match=r"tissue: not given. Plan again with tissue_mm"):
         gate(database, without)
-    assert "Tissue: not given" in plan_in_words(without.about)
+    assert "Tissue: not given" in describe_motion(without.about)
     box = {"frame": "PSM_base", "boxes": [{"low_mm": (90.0, 0.0, 0.0), "high_mm": (95.0, 1.0, 1.0)}]}
     obstacles = cases.add_plan(database, tissue_mm=None, scene=box)
     judged(database, obstacles)
@@ -193,7 +183,7 @@ def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: P
     with database.writing() as session:
         cases.agree(session, {"uses": ["training", "export"]})
         with pytest.raises(Conflict, match="none is released"):  # because consent to training had ended
-            cleared(session, find_plan(session, plan.sha256), **OF_A1_ALONE)
+            cleared(session, row := find_plan(session, plan.sha256), planned(row), OF_A1_ALONE)
         releases.release(session, find_version(session, "kestrel", cases.SUTURE, 1), "test")
     gate(database, plan)
     with database.writing() as session:
@@ -213,39 +203,55 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
             cases.agree(session, {"uses": ["training"], "until": None})
         return composed(members)
 
-    assert replay_bag(database, plan.sha256, **OF_A1_ALONE)
+    assert replay_bag(database, plan.sha256, OF_A1_ALONE)
     monkeypatch.setattr(replay, "seal", withdrawn)
     with pytest.raises(Conflict, match="does not cover export"):
-        replay_bag(database, plan.sha256, **OF_A1_ALONE)
+        replay_bag(database, plan.sha256, OF_A1_ALONE)
 
 
 @pytest.mark.parametrize(
-    ("report", "asked", "words"),
+    ("stored", "asked", "words"),
     [
-        (doubt(0.95), {}, None),
-        (doubt(0.9), {}, None),
-        (doubt(0.95, 0.91), {}, None),
-        (doubt(0.95, 0.89), {}, "only 0.890, and 0.9 is required"),
-        (doubt(0.0), {"lower_bound": 0.0}, None),
-        (doubt(0.95, None), {}, "only nan"),
-        (doubt(math.nan), {}, "only nan"),
-        (doubt(0.95), {"lower_bound": math.nan}, "nan is required"),
-        (doubt(0.85), {}, "the errors of an uncalibrated arm a pass .* Most is lost by the offset of PSM_M's base: wi"),
-        (doubt(0.95), {"errors": CALIBRATED}, "of an uncalibrated arm, which .* states the errors of a calibrated arm"),
-        (doubt(0.95, stated_by="request"), {"errors": CALIBRATED}, None),
-        (doubt(0.85, stated_by="request", errors=CALIBRATED), {}, "With the errors of a calibrated arm a pass"),
-        (doubt(), {}, "only nan"),
-        (of_another_judge(0.99, JUDGE_VERSION - 1), {}, "judged by another version of the checks; play it again"),
-        (of_another_judge(0.99, JUDGE_VERSION + 1), {}, "judged by another version"),
-        (doubt(0.99) | {"check_version": CHECK_VERSION - 1}, {}, "judged by another version"),
+        ({"doubt": doubt_of(0.95)}, {}, None),
+        ({"doubt": doubt_of(0.9)}, {}, None),
+        ({"doubt": doubt_of(0.95, 0.91)}, {}, None),
+        ({"doubt": doubt_of(0.95, 0.89)}, {}, "only 0.890, and 0.9 is required"),
+        ({"doubt": doubt_of(0.0)}, {"lower_bound": 0.0}, None),
+        ({"doubt": doubt_of(math.nan)}, {}, "only nan"),
+        ({"doubt": doubt_of(0.95)}, {"lower_bound": math.nan}, "nan is required"),
+        (
+            {"doubt": doubt_of(0.85)},
+            {},
+            "the errors of an uncalibrated arm a pass .* Most is lost by the offset of PSM_M's base: wi",
+        ),
+        (
+            {"doubt": doubt_of(0.95)},
+            {"errors": CALIBRATED},
+            "of an uncalibrated arm, which .* states the errors of a calibrated arm",
+        ),
+        ({"doubt": doubt_of(0.95), "stated_by": "request"}, {"errors": CALIBRATED}, None),
+        (
+            {"doubt": doubt_of(0.85, errors=CALIBRATED), "stated_by": "request"},
+            {},
+            "With the errors of a calibrated arm a pass",
+        ),
+        ({"doubt": doubt_of()}, {}, "only nan"),
+        (
+            {"doubt": doubt_of(0.99, version=JUDGE_VERSION - 1)},
+            {},
+            "judged by another version of the checks; play it again",
+        ),
+        ({"doubt": doubt_of(0.99, version=JUDGE_VERSION + 1)}, {}, "judged by another version"),
+        ({"doubt": doubt_of(0.99), "check_version": CHECK_VERSION - 1}, {}, "judged by another version"),
     ],
 )
-def test_the_least_certain_pass_has_to_reach_the_lower_bound(report, asked, words):
+def test_the_least_certain_pass_has_to_reach_the_lower_bound(stored, asked, words):
+    report: Any = SimpleNamespace(**{"check_version": CHECK_VERSION, "stated_by": "installation"} | stored)
     if words is None:
-        check_doubt(report, **(ASKED | asked))
+        check_probability(report, **(ASKED | asked))
     else:
         with pytest.raises(Conflict, match=words):
-            check_doubt(report, **(ASKED | asked))
+            check_probability(report, **(ASKED | asked))
 
 
 # ---- the bag
@@ -254,9 +260,9 @@ def test_the_least_certain_pass_has_to_reach_the_lower_bound(report, asked, word
 def test_the_bag_is_complete_deterministic_and_holds_the_plans_samples(database: Database, plan: Plan):
     playback = judged(database, plan)
     with pytest.raises(NotFound):
-        replay_bag(database, "0" * 64, **OF_A1_ALONE)
-    data = replay_bag(database, plan.sha256, **OF_A1_ALONE)
-    assert data == replay_bag(database, plan.sha256, **OF_A1_ALONE)
+        replay_bag(database, "0" * 64, OF_A1_ALONE)
+    data = replay_bag(database, plan.sha256, OF_A1_ALONE)
+    assert data == replay_bag(database, plan.sha256, OF_A1_ALONE)
     lines = check_bag(io.BytesIO(data))
     assert playback[:12] in lines[1]
     with database.reading() as session:
@@ -267,26 +273,26 @@ def test_the_bag_is_complete_deterministic_and_holds_the_plans_samples(database:
     papers_say_whose_it_is_and_how_far_it_goes(data, plan)
     judged(database, plan, trajectory="1" * 64)
     with pytest.raises(Corrupt, match="not the one that its verdict judged"):
-        replay_bag(database, plan.sha256, **OF_A1_ALONE)
+        replay_bag(database, plan.sha256, OF_A1_ALONE)
 
 
 def test_the_bag_has_the_judged_motion_where_another_is_computed(
     database: Database, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ):
     judged(database, plan)
-    data = replay_bag(database, plan.sha256, **OF_A1_ALONE)
+    data = replay_bag(database, plan.sha256, OF_A1_ALONE)
 
     def elsewhere(plan: SuturePlan) -> Trajectory:
         here = trajectory_of(plan)
         return replace(here, joints=np.nextafter(here.joints, np.inf))
 
-    monkeypatch.setattr(replay, "trajectory_of", elsewhere)  # as by another version of the law of motion
-    assert replay_bag(database, plan.sha256, **OF_A1_ALONE) == data
+    monkeypatch.setattr(plans, "trajectory_of", elsewhere)  # as by another version of the law of motion
+    assert replay_bag(database, plan.sha256, OF_A1_ALONE) == data
 
 
 def test_the_bag_is_signed_under_the_first_checkpoint_with_its_verdict(database: Database, plan: Plan):
     judged(database, plan)
-    data = replay_bag(database, plan.sha256, **OF_A1_ALONE)
+    data = replay_bag(database, plan.sha256, OF_A1_ALONE)
     with database.reading() as session:
         note = newest_checkpoint(session.connection()) or ""  # the export has signed the history
     head = read_notes(note)[0].checkpoint
@@ -298,7 +304,7 @@ def test_the_bag_is_signed_under_the_first_checkpoint_with_its_verdict(database:
         assert check_envelope(archive.read("signature.dsse"), str(key))["predicate"]["checkpoint"] == note
     cases.add_surgeon(database, "heron")
     sign_history(database)
-    assert replay_bag(database, plan.sha256, **OF_A1_ALONE) == data
+    assert replay_bag(database, plan.sha256, OF_A1_ALONE) == data
 
 
 def test_a_verdict_that_was_written_past_the_service_makes_no_bag(database: Database, plan: Plan):
@@ -306,14 +312,14 @@ def test_a_verdict_that_was_written_past_the_service_makes_no_bag(database: Data
     judged(database, plan, feasible=False)
     with database.reading() as session:
         row = session.scalars(select(StoredPlayback)).one()
-    report = row.report | {"feasible": True}
+    report = replace(row.report, feasible=True)
     with tampering(database) as connection:
-        values = {"feasible": True, "report": report, "sha256": sha256(canonical([plan.sha256, report]))}
+        values = {"feasible": True, "report": report, "sha256": report.identity}
         connection.execute(update(StoredPlayback).values(**values))
         connection.commit()
     assert gate(database, plan) == values["sha256"]
     with pytest.raises(Corrupt, match="A row of playbacks is not as the history has it"):
-        replay_bag(database, plan.sha256, **OF_A1_ALONE)
+        replay_bag(database, plan.sha256, OF_A1_ALONE)
 
 
 def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
@@ -323,7 +329,7 @@ def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
     assert "Every pass is likely enough to stay within reach and clear with the errors of" in readme
     assert "Not judged: a hand-off, the other arm, how exactly the tip meets its points." in readme
     assert all("Research use only" in paper["use"] for paper in papers.values())
-    assert papers["plan.json"]["passes"] == plan.about["passes"]
+    assert papers["plan.json"]["passes"] == to_jsonable_python(plan.about.passes)
     assert papers["policy.json"]["surgeon"] == papers["plan.json"]["surgeon"] == "kestrel"
     assert {"metrics", "coverage", "grid_certificate", "limits", "demos"} <= set(papers["policy.json"])
     assert "actions" not in papers["policy.json"]
@@ -340,7 +346,7 @@ def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
 
 def samples(database: Database, plan: Plan, pass_index: int | None = None) -> list[tuple[str, int]]:
     """Check a bag, and count each arm's samples."""
-    lines = check_bag(io.BytesIO(replay_bag(database, plan.sha256, pass_index=pass_index, **OF_A1_ALONE)))
+    lines = check_bag(io.BytesIO(replay_bag(database, plan.sha256, OF_A1_ALONE, pass_index)))
     return [(line.split()[0], int(line.split()[3])) for line in lines[2:-1]]
 
 
@@ -357,7 +363,7 @@ def test_both_arms_have_a_bag_and_a_pass_alone_is_a_part_of_the_whole(database: 
     judged(database, plan)
     (psm1, whole), (psm2, beside_it) = samples(database, plan)
     assert (psm1, psm2) == ("PSM1", "PSM2")
-    assert whole == beside_it == plan.about["trajectory"]["samples"]
+    assert whole == beside_it == plan.about.trajectory.samples
     assert whole == sum(samples(database, plan, number)[0][1] for number in (0, 1))
     with pytest.raises(BadPlan, match="0 to 1"):
-        replay_bag(database, plan.sha256, pass_index=2, **OF_A1_ALONE)
+        replay_bag(database, plan.sha256, OF_A1_ALONE, 2)

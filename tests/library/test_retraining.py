@@ -18,7 +18,7 @@ from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies import batches, retraining
 from skills.library.policies.batches import compare
-from skills.library.policies.training import learn_style
+from skills.library.policies.learning import learn_style
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
 from skills.schemas.training import FitOnTheSame, PolicyFigures
@@ -211,18 +211,18 @@ def test_parts_are_shared_out_and_nobody_sees_them(database: Database):
 def test_retraining_releases_only_on_request_and_stores_the_comparison(database: Database):
     cases.add_demo(database)
     (style,) = styles_of(database, retrain(database))
-    assert style.comparison["released"] is None
-    assert (style.comparison["now_released"], counted(database, Release)) == (False, 0)
+    assert style.comparison.released is None
+    assert (style.comparison.now_released, counted(database, Release)) == (False, 0)
     (style,) = styles_of(database, retrain(database, release=True))
-    assert (style.comparison["now_released"], counted(database, Release)) == (True, 1)
+    assert (style.comparison.now_released, counted(database, Release)) == (True, 1)
     (style,) = styles_of(database, retrain(database, release=True, learner=ValueIteration()))
     compared = style.comparison
-    assert (compared["released"]["version"], compared["trained"]["version"]) == (1, 2)
-    assert (compared["same_demonstration"], compared["worse_because"]) == (True, [])
-    assert (compared["now_released"], counted(database, Release)) == (True, 2)
+    assert (compared.released.version, compared.trained.version) == (1, 2)
+    assert (compared.same_demonstration, compared.worse_because) == (True, [])
+    assert (compared.now_released, counted(database, Release)) == (True, 2)
     cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)))
     (style,) = styles_of(database, retrain(database, release=True))
-    assert (style.comparison["same_demonstration"], style.comparison["now_released"]) == (False, True)
+    assert (style.comparison.same_demonstration, style.comparison.now_released) == (False, True)
 
 
 def test_a_worse_version_is_kept_and_not_released(database: Database):
@@ -231,8 +231,8 @@ def test_a_worse_version_is_kept_and_not_released(database: Database):
     job = retrain(database, release=True, learner=CellQLearning(episodes=3))
     (style,) = styles_of(database, job)
     assert (job.state, style.state, style.policy.version) == ("succeeded", "done", 2)
-    assert style.comparison["worse_because"]
-    assert style.comparison["not_released_because"].startswith("It is worse than the released version: ")
+    assert style.comparison.worse_because
+    assert style.comparison.not_released_because.startswith("It is worse than the released version: ")
     assert counted(database, Release) == 1
 
 

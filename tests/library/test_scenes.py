@@ -23,11 +23,11 @@ from skills.learning.policy import Policy
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.learning.slip_runs import FollowPolicy, follows, walk
 from skills.library.operation.integrity import covered, learnt, scene_digest
-from skills.library.policies import releases
-from skills.library.policies.releases import refusals
+from skills.library.policies import gate, releases
+from skills.library.policies.answers import roll_out
+from skills.library.policies.gate import refusals
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import odds_limits
-from skills.library.policies.versions import about_rollout
 from skills.schemas.training import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
@@ -55,22 +55,22 @@ def with_demo(database):
 def test_a_style_is_learnt_in_a_scene_stored_and_served_with_its_odds(database):
     with_demo(database)
     version = trained(database, release=True, scene_costs={"touch": 60.0})
-    said = version.manifest["scene"]
-    assert said["sha256"] == scene_digest(SCENE)
-    assert (said["scene"], said["costs"]["touch"], said["costs"]["close"]) == (SCENE.as_json(), 60.0, 0.1)
-    assert version.manifest["grid_certificate"]["refused_because"] == []
-    assert version.manifest["grid_certificate"]["suboptimal_actions"] == said["certificate"]["suboptimal"] == 0
+    said = version.manifest.scene
+    assert said.sha256 == scene_digest(SCENE)
+    assert (said.scene, said.costs.touch, said.costs.close) == (SCENE, 60.0, 0.1)
+    assert version.manifest.grid_certificate.refused_because == ()
+    assert version.manifest.grid_certificate.suboptimal_actions == said.certificate.suboptimal == 0
     with database.reading() as session:
         stored = session.merge(version)
         policy, odds = learnt(stored), covered(stored)
-        rollout = about_rollout(stored, version.manifest["start_mm"])
+        rollout = roll_out(stored, version.manifest.start_mm)
         served = releases.served(session, stored.surgeon, stored.suture)
         assert served.policy_row == stored.row
     assert policy.surroundings.scene == SCENE
     start, forbidden = policy.path.start, policy.hazards.forbidden
-    assert said["near"]["finishing"] <= odds.finishing[start] == rollout.finishing < 1
-    assert said["near"]["touching"] >= odds.touching[start] == rollout.touching > 0
-    assert said["certificate"]["starts"] == np.count_nonzero(~forbidden) < policy.path.grid.n_states
+    assert said.near.finishing <= odds.finishing[start] == rollout.finishing < 1
+    assert said.near.touching >= odds.touching[start] == rollout.touching > 0
+    assert said.certificate.starts == np.count_nonzero(~forbidden) < policy.path.grid.n_states
     assert (policy.table()[:, forbidden] == -2).all(), "a client that knows no scenes stops there"
 
 
@@ -112,8 +112,8 @@ def test_the_gate_asks_for_finishing_and_touching_and_refuses_nan(finishing, tou
     reasons = refusals(policy, certificate, near_starts(policy, coverage.share, NearLimits(radius_mm=0.1)), odds)
     assert bool(reasons) == refused
     for reason in reasons:
-        assert "touches the scene with" in reason
-        assert "value-iteration" in releases.remedy(reason)
+        assert "touches the scene with" in reason.text
+        assert "value-iteration" in gate.remedy([reason])
 
 
 def test_a_policy_that_slips_too_often_is_stored_and_not_released(database):
@@ -187,8 +187,8 @@ def test_a_batch_keeps_the_scene_of_a_style_and_its_learner(database):
     for part in parts_of(database, named):
         cases.work(database, part)
     (style,) = styles_of(database, named)
-    assert style.policy.manifest["scene"]["scene"] == SCENE.as_json()
-    assert style.policy.manifest["learner"] == "phase-q-learning"
+    assert style.policy.manifest.scene.scene == SCENE
+    assert style.policy.manifest.learner == "phase-q-learning"
 
 
 def test_a_policy_in_a_scene_has_a_digest_of_its_own_and_is_read_back():
@@ -206,7 +206,7 @@ def test_a_policy_in_a_scene_has_a_digest_of_its_own_and_is_read_back():
 def test_a_scene_changed_in_the_database_is_noticed(database):
     with_demo(database)
     version = trained(database)
-    moved = {**version.manifest, "scene": version.manifest["scene"] | {"sha256": "0" * 64}}
+    moved = version.manifest.model_copy(update={"scene": replace(version.manifest.scene, sha256="0" * 64)})
     with database.reading() as session:
         stored = session.merge(version)
         stored.manifest = moved

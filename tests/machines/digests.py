@@ -22,6 +22,7 @@ from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback,
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.demonstration.identification import identify
+from skills.fields import as_json
 from skills.formats.parsed import parse_recording
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
@@ -200,7 +201,7 @@ def played(database: Database, plan: Plan) -> dict[str, Any]:
     assert ended.state == "succeeded", ended.error
     with database.reading() as session:
         wanted = select(StoredPlayback).where(StoredPlayback.sha256 == (ended.result or {})["playback"])
-        return session.scalars(wanted).one().report
+        return as_json(session.scalars(wanted).one().report)
 
 
 if __name__ == "__main__":

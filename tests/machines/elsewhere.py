@@ -14,6 +14,7 @@ from skills.formats.parsed import parse_recording
 from skills.library.operation.inspection import inspect_installation, inspect_policies
 from skills.library.plans.playbacks import request_playback
 from skills.library.plans.replay import replay_bag
+from skills.library.plans.replay_gate import ReplayConditions
 from skills.packing import sha256
 from skills.settings import Settings
 from skills.verification.arm_errors import UNCALIBRATED
@@ -29,7 +30,7 @@ def play(database: Database, plan: str) -> dict[str, object]:
 
 
 def export(database: Database, plan: str) -> bytes:
-    return replay_bag(database, plan, errors=UNCALIBRATED, lower_bound=0.0, handoff="none")
+    return replay_bag(database, plan, ReplayConditions(UNCALIBRATED, 0.0, handoff="none"))
 
 
 def wrong(database: Database) -> Iterator[str]:

@@ -22,6 +22,7 @@ from skills.db.session import Database
 from skills.errors import SkillsError
 from skills.formats.parsed import parse_recording
 from skills.library.plans.replay import replay_bag
+from skills.library.plans.replay_gate import ReplayConditions
 from skills.library.policies.relearning import StoredRecordings, learn_again
 from skills.settings import Settings
 from skills.verification.arm_errors import UNCALIBRATED
@@ -60,7 +61,7 @@ def seen(url: str) -> dict[str, Any]:
 
 def _bag(database: Database, plan: str) -> str:
     try:
-        bag = replay_bag(database, plan, errors=UNCALIBRATED, lower_bound=LEAST, handoff="none")
+        bag = replay_bag(database, plan, ReplayConditions(UNCALIBRATED, LEAST, handoff="none"))
     except SkillsError as refused:
         return refused.words()
     return sha256(bag).hexdigest()

@@ -19,7 +19,6 @@ from skills.library.people.surgeons import find_surgeon
 from skills.library.plans.playbacks import find_playback, request_playback, standing_of
 from skills.library.policies import releases
 from skills.library.recordings.demos import upload_demo
-from skills.packing import canonical
 from skills.planning import handoff
 from skills.planning.handoff import OtherArm
 from skills.planning.trajectory import A1, PassPath, Trajectory, time_parametrise
@@ -206,12 +205,12 @@ def played(database: Database, plan: Plan) -> StoredPlayback:
 def test_the_same_plan_has_the_same_playback_in_another_database(databases):
     one, other = (played(database, cases.add_plan(database)) for database in databases)
     assert one.sha256 == other.sha256
-    assert canonical(one.report) == canonical(other.report)
-    assert one.report["feasible"] is True
-    assert {deviation["kind"] for deviation in one.report["intent"]} == set(LIMITS)
-    assert one.report["plan"] == one.plan.sha256
-    assert one.report["files"].keys() == {"psm.urdf", "suture_pad.urdf", "needle.urdf"}
-    assert one.report["arms"][0]["instrument"]["arm"]["remote_centre_mm"] == 431.8
+    assert one.report == other.report
+    assert one.report.feasible is True
+    assert {deviation.kind for deviation in one.report.intent} == set(LIMITS)
+    assert one.report.plan == one.plan.sha256
+    assert one.report.files.keys() == {"psm.urdf", "suture_pad.urdf", "needle.urdf"}
+    assert one.report.arms[0].instrument.arm.remote_centre_mm == 431.8
 
 
 def test_a_mistake_of_planning_is_found_by_the_service(databases, monkeypatch):
@@ -224,9 +223,9 @@ def test_a_mistake_of_planning_is_found_by_the_service(databases, monkeypatch):
     monkeypatch.setattr("skills.planning.plan.realign", wrong)
     database, _ = databases
     found = played(database, cases.add_plan(database, psm_m={"approach": PSM_M})).report
-    assert (found["feasible"], found["failure"]["quantity"]) == (False, "A2 off the paper's hand-off")
-    assert found["failure"]["value"] == pytest.approx(30.0)
-    assert "A2 off the paper's hand-off is 30 deg, the limit is 0.1" in found["failure_in_words"]
+    assert (found.feasible, found.failure.quantity) == (False, "A2 off the paper's hand-off")
+    assert found.failure.value == pytest.approx(30.0)
+    assert "A2 off the paper's hand-off is 30 deg, the limit is 0.1" in found.failure_in_words
 
 
 def test_a_policy_withdrawn_after_planning_is_told_with_the_playback(databases):

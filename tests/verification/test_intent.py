@@ -16,7 +16,7 @@ from skills.gridworld.scene import Box, Scene, Tissue
 from skills.kinematics import forward, instrument_of, joint_margins, matrix_of, quaternion_of
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.library.plans.playbacks import CHECK_VERSION
+from skills.library.plans.headline import CHECK_VERSION
 from skills.packing import canonical, sha256
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePoint, stack

@@ -14,6 +14,7 @@ from typing import Any, get_args
 from fastapi import Request, Response
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from pydantic_core import to_jsonable_python
 
 from skills.api.authorisation import Caller, Role
 from skills.api.pages.assets import build
@@ -68,6 +69,7 @@ def templates() -> Environment:
     )
     made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": plain_json}
     made.filters |= FILTERS
+    made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": to_jsonable_python}  # values and models too
     return made
 
 

@@ -358,11 +358,13 @@ def _steps(spots: Floats, apart_mm: Floats) -> Markup:
 
 def card_page(card: Card) -> str:
     """Return the HTML of a policy card."""
-    facts, partner = card.written(), card.demo.partner
+    facts, partner = card.facts, card.demo.partner
     return standalone(
         "card",
         card=facts,
-        metric={one["name"]: one for one in facts["metrics"]},
+        training=vars(facts.learner.training),
+        reward_levels=vars(facts.learner.reward_levels),
+        metric={one.name: one for one in facts.metrics},
         path_states=len(card.path.states),
         lost_mm=hypot(*discretisation_rmse(card.demo.tip_mm, card.path.grid, card.path.hysteresis)),
         views=path_views(card.demo, card.path, card.combined),

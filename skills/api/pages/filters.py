@@ -7,7 +7,7 @@ from math import degrees
 from typing import Any
 
 from skills.library.operation.styles import StyleState
-from skills.library.plans.playbacks import error_called
+from skills.library.plans.headline import describe_error
 
 MISSING = "–"
 STATE_MARKS = {"released": "●", "trained": "◐", "stored": "○", "empty": "·"}
@@ -121,7 +121,7 @@ FILTERS = {
     "degrees": degrees,
     "outline": outline,
     "state_mark": STATE_MARKS.__getitem__,
-    "error_called": error_called,
+    "describe_error": describe_error,
     "state_words": STATE_WORDS.__getitem__,
     "job_mark": JOB_MARKS.__getitem__,
 }

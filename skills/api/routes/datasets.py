@@ -5,10 +5,9 @@ from functools import partial
 from fastapi import Request, Response
 
 from skills.api.authorisation import needs
-from skills.api.dependencies import Actor, Db, Digest, Jobs, room_for_a_job
+from skills.api.dependencies import Accept, Actor, Db, Digest, Jobs, room_for_a_job
 from skills.api.openapi import ends, gives, gives_file, router_of, starts_job
 from skills.api.responses import Condition, Giving, accepted
-from skills.api.routes.policies import Accept
 from skills.api.streams import stored_file
 from skills.api.strict_json import Strict
 from skills.db.service_tables import StoredDataset

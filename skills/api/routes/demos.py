@@ -6,12 +6,11 @@ from typing import Annotated
 from fastapi import Query, Request, Response
 
 from skills.api.authorisation import erasing_is_for_admins, needs
-from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, Parse, RowCursor
+from skills.api.dependencies import Accept, Actor, Db, Digest, Jobs, Limit, Parse, RowCursor
 from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
 from skills.api.responses import Condition, Giving, refuse_changed, stored
-from skills.api.routes.policies import Accept
 from skills.api.routes.recordings import RAW_BODY
 from skills.api.streams import stored_file
 from skills.api.strict_json import Strict

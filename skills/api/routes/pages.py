@@ -12,22 +12,34 @@ from sqlalchemy.orm import Session
 
 from skills import errors
 from skills.api.authorisation import Asking, Caller, needs, open_to_all
-from skills.api.dependencies import Configured, Db, Digest, Limit, Parse, RowCursor, Slug, SlugCursor
+from skills.api.dependencies import (
+    Configured,
+    Db,
+    Digest,
+    JobId,
+    Limit,
+    Parse,
+    RowCursor,
+    Slug,
+    SlugCursor,
+    Version,
+)
 from skills.api.pages import drawings, render
 from skills.api.pages.assets import assets, build
 from skills.api.responses import JSON
-from skills.api.routes.policies import JobId, Version
 from skills.db.session import Database
+from skills.fields import Point
 from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library.comparison import scores
 from skills.library.operation import jobs, overview, styles, views
 from skills.library.people.surgeons import list_surgeons
-from skills.library.plans.plans import find_plan, followed_plan, hands_over, plan_in_words
+from skills.library.plans.description import describe_motion
+from skills.library.plans.plans import find_plan, followed_plan
 from skills.library.plans.playbacks import headline_of
-from skills.library.plans.replay import refusal_of_bag
+from skills.library.plans.replay_gate import refusal_of_bag
 from skills.library.policies import releases, retraining, versions
-from skills.library.policies.releases import outcomes_of
+from skills.library.policies.outcomes import describe_job
 from skills.library.recordings.demos import find_demo, shown_demo
 from skills.library.recordings.recordings import find_recording
 from skills.planning.handoff import Enters
@@ -244,7 +256,7 @@ def show_plans(page: Page, settings: Configured, cursor: RowCursor = None) -> Re
     """Show the newest plans with their verdicts."""
     with page.db.reading() as session:
         found = [
-            (plan, plan_in_words(plan.about), None if played is None else headline_of(played, settings))
+            (plan, describe_motion(plan.about), None if played is None else headline_of(played, settings))
             for plan, played in overview.newest_plans(session, cursor)
         ]
         return page.show("plans.html", found=found, most=overview.MOST)
@@ -280,11 +292,11 @@ def show_plan_editor(
             before=before,
             instruments=sorted(INSTRUMENTS),
             enters=get_args(Enters),
-            assumed=None if policy is None else _assumed_psm_m(policy.manifest["goal_mm"]),
+            assumed=None if policy is None else _assumed_psm_m(policy.manifest.goal_mm),
         )
 
 
-def _assumed_psm_m(goal_mm: list[float]) -> dict[str, str]:
+def _assumed_psm_m(goal_mm: Point) -> dict[str, str]:
     """Return a plausible PSM_M for a demonstration without one: placed relative to the goal as in the samples."""
     base_mm = [round(at + off, 1) for at, off in zip(goal_mm, PSM_M_FROM_GOAL_MM, strict=True)]
     return {"approach": "-0.94, 0.1, -0.33", "base_mm": ", ".join(f"{x:g}" for x in base_mm), "base_xyzw": PSM_M_TURN}
@@ -300,8 +312,8 @@ def show_plan(plan: Digest, page: Page, settings: Configured) -> Response:
             "plan.html",
             plan=found,
             played=[(one, headline_of(one.playback, settings)) for one in overview.playbacks_of(session, found)],
-            in_words=plan_in_words(found.about),
-            hands_over=hands_over(found.about),
+            in_words=describe_motion(found.about),
+            hands_over=found.about.psm_m is not None,
             no_bag=None if refusal is None else refusal.words(Door.HTTP),
             job=overview.newest_job(session, "playback", plan=found.sha256),
         )
@@ -334,7 +346,7 @@ def show_job(job: JobId, page: Page, limit: Limit = overview.MOST, cursor: RowCu
         return page.show(
             "job.html",
             job=found,
-            came_of=outcomes_of(session, [found])[found.row],
+            described=describe_job(session, found),
             counts=jobs.count(session, found.row) if batch else None,
             styles=retraining.list_styles(session, found, limit, cursor, None) if batch else [],
             limit=limit,

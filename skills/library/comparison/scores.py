@@ -342,7 +342,7 @@ def _reference(session: Session, slug: str, suture: str, digest: str | None = No
     served = releases.served(session, surgeon, suture)
     if served is not None:
         policy = served.policy
-        more = len(policy.manifest["demos"]) - 1
+        more = len(policy.manifest.demos) - 1
         rest = f" and {more} more" if more else ""
         return policy.demonstration, f"the released policy, version {policy.version}, was learnt from it{rest}"
     newest = newest_demo(session, surgeon.row, suture)

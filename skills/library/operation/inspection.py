@@ -50,12 +50,11 @@ from skills.library.comparison.calibrations import read_calibration
 from skills.library.operation.history import Verified, verify_history
 from skills.library.operation.integrity import covered, demo_identity, planned, posed
 from skills.library.operation.jobs import identity_of
+from skills.library.policies.combined import path_of
+from skills.library.policies.pose_styles import poses_of_demonstrations
 from skills.library.policies.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
-from skills.library.policies.versions import path_of, poses_of_demonstrations
 from skills.library.recordings.content_cache import alike, cached_content, read_entry
 from skills.library.recordings.recordings import Parser, recording_bytes
-from skills.packing import canonical, sha256
-from skills.schemas.policy_document import policy_identity
 from skills.settings import Settings
 from skills.transparency.notes import Note
 
@@ -413,17 +412,16 @@ def _reward_map(row: StoredRewardMap) -> Why:
 
 def _policy(row: PolicyVersion) -> Why:
     manifest, demonstrations = row.manifest, row.demonstrations
-    if policy_identity(manifest, row.learnt) != row.sha256:
+    if manifest.identity(digest(row.learnt)) != row.sha256:
         yield "it differs from the certified policy"
     covered(row)
-    if row.releasable != (not manifest["grid_certificate"]["refused_because"]):
+    if row.releasable != (not manifest.grid_certificate.refused_because):
         yield "its flag `releasable` contradicts its certificate"
-    if (manifest["surgeon"], manifest["suture"]) != (row.surgeon.slug, row.suture):
+    if manifest.style != (row.surgeon.slug, row.suture):
         yield "its manifest names another style"
-    there, said = row.learnt.surroundings, manifest.get("scene")
-    if (there and there.as_json()) != (said and {name: said[name] for name in ("scene", "costs")}):
+    if manifest.surroundings != row.learnt.surroundings:
         yield "its manifest states another scene than it was learnt in"
-    if manifest["demos"] != [one.sha256 for one in demonstrations]:
+    if manifest.demos != [one.sha256 for one in demonstrations]:
         yield "it was learnt from another demonstration"
     if any((one.surgeon_row, one.suture) != (row.surgeon_row, row.suture) for one in demonstrations):
         yield "its demonstration is of another style"
@@ -446,7 +444,7 @@ def _release(row: Release) -> Why:
     if not policy.releasable:
         yield "its policy did not pass the gate"
     if row.withdrawn_at is None:
-        yield from (f"it is not withdrawn, but its demonstration {what}" for what in policy.objections)
+        yield from (f"it is not withdrawn, but its demonstration {one.text}" for one in policy.objections)
 
 
 def _plan(row: Plan) -> Why:
@@ -455,11 +453,11 @@ def _plan(row: Plan) -> Why:
 
 
 def _playback(row: StoredPlayback) -> Why:
-    if sha256(canonical([row.plan.sha256, row.report])) != row.sha256:
+    if (row.report.plan, row.report.identity) != (row.plan.sha256, row.sha256):
         yield "it does not match the digest of plan and verdict"
-    if row.feasible != row.report["feasible"]:
+    if row.feasible != row.report.feasible:
         yield "its flag `feasible` contradicts its report"
-    if digest(row.measured.trajectory) != row.report["trajectory"]:
+    if digest(row.measured.trajectory) != row.report.trajectory:
         yield "its motion is not the one that was judged"
 
 

@@ -29,7 +29,7 @@ from skills.learning.tube import CertifiedPoses, clear_tube
 from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.remedies import Remedy
-from skills.schemas.policy_document import policy_identity
+from skills.schemas.policies import PolicyManifest
 
 Row = TypeVar("Row", Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording, StoredDataset)
 
@@ -70,9 +70,7 @@ def find_by_digest(session: Session, table: type[Row], digest: str, what: str, *
     return found[0]
 
 
-_policies: WeightedCache[str, tuple[dict[str, Any], Policy]] = WeightedCache(
-    32
-)  # by digest, with its manifest; a few MB each
+_policies: WeightedCache[str, tuple[PolicyManifest, Policy]] = WeightedCache(32)  # by digest; a few MB each
 
 
 def learnt(version: PolicyVersion) -> Policy:
@@ -84,7 +82,7 @@ def learnt(version: PolicyVersion) -> Policy:
     manifest, policy = _policies.get(version.sha256) or (None, None)
     if policy is None or manifest != version.manifest:  # the API serves the row's manifest, so it is verified too
         policy = version.learnt
-        if policy_identity(version.manifest, policy) != version.sha256:
+        if version.manifest.identity(digest(policy)) != version.sha256:
             raise Corrupt("A stored policy does not match its digest; restore it from a backup or train it again.")
         _policies.put(version.sha256, (version.manifest, policy))
     return policy
@@ -107,7 +105,7 @@ def posed(stored: StoredPoses) -> CertifiedPoses:
         poses = stored.poses
         if poses_identity_of(policy, digest(poses)) != stored.sha256:
             raise Corrupt("A stored pose style does not match its digest; restore it from a backup or train again.")
-        if "scene" in stored.policy.manifest and (scene := learnt_in(stored.policy)) is not None:
+        if stored.policy.manifest.scene is not None and (scene := learnt_in(stored.policy)) is not None:
             poses = clear_tube(poses, scene)
         _poses.put(policy, (stored.sha256, poses))
     return poses
@@ -132,7 +130,7 @@ def covered(version: PolicyVersion) -> Coverage:
         Corrupt: It does not match the digest in the version's manifest.
     """
     coverage = version.covered
-    if digest(coverage) != version.manifest["coverage"]["sha256"]:
+    if digest(coverage) != version.manifest.coverage.sha256:
         raise Corrupt("The coverage of a stored policy does not match its digest; restore it from a backup.")
     return coverage
 

@@ -27,11 +27,10 @@ from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
 from skills.library.operation import locks
 from skills.library.people.consent import require
-from skills.library.policies.releases import Outcome, is_served, outcomes_of
+from skills.library.policies.releases import is_served
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
-from skills.schemas.operation import Job as JobAnswer
-from skills.schemas.operation import ServedNow
+from skills.schemas.training import StoredComparison
 
 BATCH, PART = "retraining", "retraining-part"
 EXPORT, PICTURES = "dataset", "pictures"
@@ -77,10 +76,10 @@ def changed_since(session: Session, batch: int) -> set[int]:
     return {row for row, compared, now in session.execute(done.where(*mine)) if now != _served_then(compared)}
 
 
-def _served_then(comparison: dict[str, Any]) -> str | None:
+def _served_then(comparison: StoredComparison) -> str | None:
     """Return the digest of the version that a style served when a batch ended it."""
-    served = comparison["trained"] if comparison["now_released"] else comparison["released"]
-    return None if served is None else str(served["sha256"])
+    served = comparison.trained if comparison.now_released else comparison.released
+    return None if served is None else served.sha256
 
 
 def count_serving(session: Session, batch: int) -> tuple[int, int]:
@@ -149,7 +148,7 @@ QUEUED = "A new job is queued."  # `RequestedJob.did` of a new job
 JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 
 
-KEPT = "kept"  # `joins` of a batch in which each style keeps the joining rule of the policy that it serves
+JOIN_AS_SERVED = "as served"  # `joins` of a batch in which each style keeps the joining rule of its served policy
 
 
 class TrainingRequest(TypedDict):
@@ -184,7 +183,7 @@ class RetrainingRequest(TypedDict):
     poses: int
     near: dict[str, float]
     odds: dict[str, float]
-    joins: str | None  # `KEPT`; None where the request names a learner
+    joins: str | None  # `JOIN_AS_SERVED`; None where the request names a learner
     seed: int
     release: bool
     styles: NotRequired[int]
@@ -404,31 +403,3 @@ def cancel(session: Session, job_id: str, actor: str) -> Job:
     session.refresh(job)
     record_event(session, actor, "cancel", f"job-{job.kind}", job.id)
     return job
-
-
-def describe_jobs(session: Session, jobs: Sequence[Job]) -> list[JobAnswer]:
-    """Return jobs with their outcomes, as the API answers."""
-    outcomes = outcomes_of(session, jobs)
-    return [_answer(job, outcomes[job.row], None) for job in jobs]
-
-
-def describe_job(session: Session, job: Job, did: str | None = None) -> JobAnswer:
-    """Return a job with its outcome and the effect of the request that it answers."""
-    return _answer(job, outcomes_of(session, [job])[job.row], did)
-
-
-def _answer(job: Job, outcome: Outcome, did: str | None) -> JobAnswer:
-    return JobAnswer(
-        id=job.id,
-        kind=job.kind,
-        state=job.state,
-        progress=job.progress,
-        request=job.request,
-        result=outcome.result,
-        served=None if outcome.served is None else ServedNow(**outcome.served),
-        did=did,
-        error=job.error,
-        created_at=job.created_at,
-        started_at=job.started_at,
-        ended_at=job.ended_at,
-    )

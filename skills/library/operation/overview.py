@@ -6,9 +6,17 @@ from dataclasses import dataclass
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, Plan, StoredPictures, StoredPlayback, StoredRecording, Surgeon, SutureType
+from skills.db.models import (
+    Demonstration,
+    Plan,
+    StoredPictures,
+    StoredPlayback,
+    StoredRecording,
+    Surgeon,
+    SutureType,
+)
 from skills.db.service_tables import Job
-from skills.library.plans import playbacks
+from skills.library.plans.playback_pictures import job_of_pictures
 
 MOST = 50  # rows of a list on a page
 MOST_LISTED = 200  # of a style's versions and demonstrations, or in a selection, where of more nobody chooses by eye
@@ -79,7 +87,7 @@ def playbacks_of(session: Session, plan: Plan) -> list[Played]:
 
 def _played(session: Session, playback: StoredPlayback) -> Played:
     drawn = session.scalar(select(StoredPictures.row).where(StoredPictures.playback_row == playback.row))
-    job = None if drawn else playbacks.job_of_pictures(session, playback)
+    job = None if drawn else job_of_pictures(session, playback)
     return Played(playback, drawn is not None, job)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from sqlalchemy import ColumnElement, Select, case, exists, func, select
+from sqlalchemy import JSON, ColumnElement, Select, case, exists, func, select, type_coerce
 from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release, Surgeon, SutureType
@@ -157,7 +157,7 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     wanted = {**newest_version, **released}
     # Columns and not entities, of which a page has hundreds; and of manifests the part that is shown.
     shown = [("grid", "shape"), ("waypoints",), ("coverage", "mean_share"), ("metrics", "dtw_total_mm")]
-    manifest = [by.manifest[names] for names in shown]
+    manifest = [type_coerce(by.manifest, JSON)[names] for names in shown]
     others = select(func.max(PolicyDemonstration.demonstration_row)).where(PolicyDemonstration.policy_row == by.row)
     about = select(by.row, by.version, by.demonstration_row, others.scalar_subquery(), *manifest)
     told = {row: rest for row, *rest in session.execute(about.where(by.row.in_(wanted.values())))}

@@ -17,7 +17,7 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.policy import Policy
 from skills.library.operation.integrity import covered, learnt
 from skills.library.people.recorded import shown_recording
-from skills.library.policies.versions import learnt_from
+from skills.library.policies.combined import learnt_from
 from skills.library.recordings.recordings import Parser
 
 MOST_STARTS = 20_000  # drawn smoothly by a browser: of a larger grid every second, third, ... cell is returned

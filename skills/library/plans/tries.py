@@ -36,24 +36,18 @@ from skills.library.operation.jobs import RequestedJob, Store, identity_of
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
-from skills.library.plans.plans import find_plan, hand_of, plan_sutures
+from skills.library.plans.headline import describe_errors
+from skills.library.plans.plans import hand_of, plan_sutures
 from skills.library.plans.playbacks import (
     check_playback,
-    errors_in_words,
     find_playback,
     headline_of,
     playback_request,
 )
 from skills.library.policies import releases
-from skills.library.policies.training import (
-    learn_style,
-    lessons,
-    near_limits,
-    odds_limits,
-    store_style,
-    training_request,
-    with_partners,
-)
+from skills.library.policies.gate import join_reasons, remedy
+from skills.library.policies.learning import learn_style, lessons, store_style, with_partners
+from skills.library.policies.training import near_limits, odds_limits, training_request
 from skills.library.recordings.demos import add_demo, find_demo
 from skills.library.recordings.parts import choose_part
 from skills.library.recordings.recordings import Parser, confined_reader, find_recording, stored_recording
@@ -328,33 +322,32 @@ def _learn(
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
         version = session.get_one(PolicyVersion, store_style(session, made).row)
         assert version.surgeon.slug == asked.surgeon  # loaded here, for the time after the session
-    metrics = made.manifest["metrics"]
+    metrics = made.manifest.metrics
     text = (
-        f"Version {version.version} by {made.manifest['learner']}: it reproduces {metrics['exact_states']} of "
-        f"{metrics['path_states']} states of the demonstration, DTW {metrics['dtw_total_mm']:g} mm."
+        f"Version {version.version} by {made.manifest.learner}: it reproduces {metrics.exact_states} of "
+        f"{metrics.path_states} states of the demonstration, DTW {metrics.dtw_total_mm:g} mm."
     )
     return version, _done("train", text, made.sha256)
 
 
 def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:
     """Return the step of the certificate; one that forbids the release does not end the try."""
-    manifest = version.manifest
-    certificate, coverage = manifest["grid_certificate"], manifest["coverage"]
-    near = certificate["near"]
-    optimal = certificate["states_checked"] - certificate["suboptimal_actions"]
+    certificate, coverage = version.manifest.grid_certificate, version.manifest.coverage
+    near = certificate.near
+    optimal = certificate.states_checked - certificate.suboptimal_actions
     text = (
-        f"{optimal} of {certificate['states_checked']} actions are optimal, {coverage['starts_reaching_goal']} of "
-        f"{coverage['n_states']} starts reach the goal, and each within {near['radius_mm']:g} mm of the demonstrated "
-        f"one follows at least {near['share']:.0%} of the demonstration (limit {near['least_share']:.0%})."
+        f"{optimal} of {certificate.states_checked} actions are optimal, {coverage.starts_reaching_goal} of "
+        f"{coverage.n_states} starts reach the goal, and each within {near.radius_mm:g} mm of the demonstrated "
+        f"one follows at least {near.share:.0%} of the demonstration (limit {near.least_share:.0%})."
     )
-    reasons = certificate["refused_because"]
+    reasons = certificate.refused_because
     if not reasons:
         return _done("certify", f"{text} It passes the gate of a release.", version.sha256)
-    remedies = tuple(dict.fromkeys(releases.remedy(one) for one in reasons))
+    remedies = tuple(dict.fromkeys(remedy([one]) for one in reasons))
     return TryStep(
         name="certify",
         state="refused",
-        text=f"{text} It cannot be released: {'; '.join(reasons)}.",
+        text=f"{text} It cannot be released: {join_reasons(reasons)}.",
         choices=tuple(others),
         remedies=remedies,
         id=version.sha256,
@@ -401,7 +394,7 @@ def _release(
 
 def _plan(database: Database, asked: TryIn, version: PolicyVersion, actor: str) -> tuple[str, str]:
     """Plan one pass at the demonstrated place; return the plan's digest, and the step in words."""
-    goal_mm = version.manifest["goal_mm"]
+    goal_mm = version.manifest.goal_mm
     with database.reading() as session:
         demo = hand_of(session.get_one(PolicyVersion, version.row))
     alone = asked.psm_m is None and demo.partner is None
@@ -409,18 +402,16 @@ def _plan(database: Database, asked: TryIn, version: PolicyVersion, actor: str) 
         surgeon=asked.surgeon,
         suture=asked.suture,
         version=version.version,
-        suture_points=[SuturePointIn(position_mm=tuple(goal_mm))],
+        suture_points=[SuturePointIn(position_mm=goal_mm)],
         psm_m=asked.psm_m,
         handoff="none" if alone else None,
         tissue_mm=None if isinstance(asked.tissue_mm, str) else asked.tissue_mm,
     )
     row, _ = plan_sutures(database, request, actor)
-    with database.reading() as session:
-        about = find_plan(session, row.sha256).about
     where = ", ".join(f"{one:.1f}" for one in goal_mm)
     why = " Neither the recording nor the request has PSM_M, so nothing is handed over." if alone else ""
     return row.sha256, (
-        f"One pass of {about['trajectory']['duration_s']:.1f} s to ({where}) mm, where it was demonstrated.{why}"
+        f"One pass of {row.about.trajectory.duration_s:.1f} s to ({where}) mm, where it was demonstrated.{why}"
     )
 
 
@@ -430,23 +421,23 @@ def _play(database: Database, asked: TryIn, plan: str, actor: str, settings: Set
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
         playback = store(session, actor)["playback"]
     with database.reading() as session:
-        samples = find_plan(session, plan).about["trajectory"]["samples"]
-        errors = find_playback(session, playback).report["doubt"]["under"][0]["errors"]["name"]
-    words = f"{samples} samples in the simulator, and 1000 worlds with {errors_in_words(errors)}."
+        row = find_playback(session, playback)
+    errors = row.report.doubt.under[0].errors.name
+    words = f"{row.report.samples} samples in the simulator, and 1000 worlds with {describe_errors(errors)}."
     return playback, words
 
 
 def _verdict(database: Database, asked: TryIn, playback: str, settings: Settings, others: Sequence[Choice]) -> TryStep:
     with database.reading() as session:
         row = find_playback(session, playback)
-        line, failure = headline_of(row, settings), row.report["failure"]
-        lowest_mm = min(z for one in row.plan.about["passes"] for _, _, z in one["path_mm"])
+        line, failure = headline_of(row, settings), row.report.failure
+        lowest_mm = min(z for one in row.plan.about.passes for _, _, z in one.path_mm)
     choices: list[Choice] = []
     remedies: list[str] = []
-    if line["level"] == "bad" and failure is None and asked.errors == "uncalibrated":
+    if line.level == "bad" and failure is None and asked.errors == "uncalibrated":
         words = "judge it with the errors of a calibrated arm, if yours is one"
         choices.append(Choice(words=words, change={"errors": "calibrated"}))
-    elif failure is not None and failure["quantity"] == SCENE:
+    elif failure is not None and failure.quantity == SCENE:
         remedies.append(
             f"Measure the tissue again: it is stated at {asked.tissue_mm} mm, and the tip goes down to {lowest_mm:.1f} "
             "mm. Or record the hand-off further above it."
@@ -456,7 +447,7 @@ def _verdict(database: Database, asked: TryIn, playback: str, settings: Settings
     return TryStep(
         name="verdict",
         state="done",
-        text=line["text"],
+        text=line.text,
         choices=tuple(choices),
         remedies=tuple(remedies),
         id=playback,

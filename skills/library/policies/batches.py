@@ -19,7 +19,7 @@ from threading import RLock
 from time import monotonic
 from typing import Any, cast
 
-from sqlalchemy import JSON, Table, bindparam, select, union_all, update
+from sqlalchemy import Table, bindparam, select, union_all, update
 from sqlalchemy.orm import Session
 
 from skills.comparison.combining import Combining
@@ -29,14 +29,14 @@ from skills.db.packed import unpack_as
 from skills.db.service_tables import LONGEST_REASON, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Busy, Conflict, SkillsError
-from skills.fields import as_json
 from skills.learning.policy import Policy
 from skills.library.operation import integrity, jobs, locks
 from skills.library.operation.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
 from skills.library.people.consent import refusal
 from skills.library.policies import releases
-from skills.library.policies.releases import fit_of, not_worse, shown_mm, taught, way_of
-from skills.library.policies.training import (
+from skills.library.policies.combined import refuse_unlike
+from skills.library.policies.fit import compare_paths, format_mm, not_worse, policy_path, reference_paths
+from skills.library.policies.learning import (
     Learnt,
     Lesson,
     Stored,
@@ -46,9 +46,10 @@ from skills.library.policies.training import (
     store_styles,
     with_partners,
 )
-from skills.library.policies.versions import LearntIn, Recipe, kept_of, learner_kept, recipes_of, refuse_unlike
+from skills.library.policies.served_settings import ServedSettings, learner_for, settings_of_served
 from skills.library.recordings.demos import newest_demos
 from skills.library.recordings.recordings import Parser, confined_reader
+from skills.schemas.policies import PolicyManifest
 from skills.schemas.training import FitOnTheSame, PolicyFigures, StoredComparison
 from skills.settings import Settings
 
@@ -85,7 +86,7 @@ OUTCOME = (
         state=bindparam("became"),
         policy_row=bindparam("policy"),
         reason=bindparam("why"),
-        comparison=bindparam("compared", type_=JSON(none_as_null=True)),
+        comparison=bindparam("compared", type_=_STYLES.c.comparison.type),
         ended_at=bindparam("now"),
     )
 )
@@ -121,16 +122,13 @@ AT_WORK = RLock()
 class _Style:
     """A queued style of a part: its lesson, and the number of times that it was started.
 
-    With a recipe, the style serves a policy of several demonstrations, and is learnt from as many, combined in the same
-    way. With a rule, it serves a policy with that joining rule; with `there`, one that was learnt in that scene.
+    `served` are the settings of the policy that it serves, which the new one keeps; None: it serves none.
     """
 
     row: int
     tries: int
     lesson: Lesson
-    recipe: Recipe | None
-    rule: float | None = None
-    there: LearntIn | None = None
+    served: ServedSettings | None
 
 
 _Group = Sequence[_Style]  # started in one transaction, trained one after another
@@ -145,7 +143,7 @@ class _Batch:
     request: RetrainingRequest
     requested_by: str
     settings: Settings
-    tell: Parser
+    parse: Parser
 
     def training_of(self, style: _Style, demos: Sequence[str], how: Combining | None = None) -> TrainingRequest:
         """Return the request for one style as `request_training` writes it, so that an equal training is recognised."""
@@ -154,7 +152,7 @@ class _Batch:
             "surgeon": lesson.surgeon.slug,
             "suture": lesson.suture,
             "demos": [*demos],
-            "learner": learner_kept(shared, style.rule, style.there),
+            "learner": learner_for(shared, style.served),
             "learner_version": shared["learner_version"],
             "gate": shared["gate"],
             "poses": shared["poses"],
@@ -162,8 +160,8 @@ class _Batch:
             "seed": shared["seed"],
             "release": shared["release"],
         }
-        if style.there is not None:
-            request |= {"surroundings": style.there.surroundings, "odds": shared["odds"]}
+        if style.served is not None and style.served.surroundings is not None:
+            request |= {"surroundings": style.served.surroundings.as_json(), "odds": shared["odds"]}
         if how is not None:
             request["combine"] = {"kind": how.kind}
         return request
@@ -220,13 +218,9 @@ def _waiting(database: Database, part: int) -> list[_Style]:
         rows = session.execute(left.order_by(of.tries, of.row)).all()
         read = {lesson.row: lesson for lesson in lessons(session, [demonstration for demonstration, *_ in rows])}
         surgeons = {lesson.surgeon.row for lesson in read.values()}
-        recipes, kept = recipes_of(session, surgeons), kept_of(session, surgeons)
-    styles = []
-    for demonstration, row, tries in rows:
-        lesson = read[demonstration]
-        name = lesson.surgeon.row, lesson.suture
-        styles.append(_Style(row, tries, lesson, recipes.get(name), kept.rules.get(name), kept.scenes.get(name)))
-    return styles
+        served = settings_of_served(session, surgeons)
+    found = [(row, tries, read[demonstration]) for demonstration, row, tries in rows]
+    return [_Style(row, tries, one, served.get((one.surgeon.row, one.suture))) for row, tries, one in found]
 
 
 def _groups(styles: Sequence[_Style]) -> list[_Group]:
@@ -260,22 +254,21 @@ def _refused(database: Database, group: _Group) -> dict[int, SkillsError]:
 
 
 def _learn(database: Database, batch: _Batch, style: _Style) -> Learnt | SkillsError:
-    lesson, recipe = style.lesson, style.recipe
+    lesson, served = style.lesson, style.served
     try:
-        if recipe is None:
-            (lesson,) = with_partners(database, [lesson], batch.tell)
-            return learn_style(lesson, batch.training_of(style, [lesson.sha256]), batch.settings)
-        with database.reading() as session:
-            newest = newest_demos(session, lesson.surgeon.row, lesson.suture, recipe.demos)
-            refuse_unlike(newest)
-            found = lessons(session, [one.row for one in newest])
+        found, combining = [lesson], None if served is None else served.combining
+        if served is not None and combining is not None:
+            with database.reading() as session:
+                newest = newest_demos(session, lesson.surgeon.row, lesson.suture, served.demos)
+                refuse_unlike(newest)
+                found = lessons(session, [one.row for one in newest])
         if not found:
             return Conflict("All demonstrations of the style were withdrawn or marked since the batch was requested.")
-        found = with_partners(database, found, batch.tell)
-        if len(found) == 1:  # the others were withdrawn since, and the served policy with them
-            return learn_style(found[0], batch.training_of(style, [found[0].sha256]), batch.settings)
-        asked = batch.training_of(style, [one.sha256 for one in found], recipe.how)
-        return learn_style(combined_lesson(found, recipe.how), asked, batch.settings)
+        found = with_partners(database, found, batch.parse)
+        if len(found) == 1:  # also if the others were withdrawn since, and the served policy with them
+            combining = None
+        asked = batch.training_of(style, [one.sha256 for one in found], combining)
+        return learn_style(found[0] if combining is None else combined_lesson(found, combining), asked, batch.settings)
     except Busy:  # the database or a reader, for now: the part is tried again
         raise
     except SkillsError as refused:
@@ -325,7 +318,7 @@ def _outcomes(
         ending = {"style": style.row, "now": now(), "policy": None, "compared": None, "why": None}
         if isinstance(one, Learnt) and isinstance(at, Stored):
             compared = measured[one.sha256] if one.sha256 in released else None
-            comparison = _kept(session, batch, one, at, compared)
+            comparison = _compared(session, batch, one, at, compared)
             yield {**ending, "became": "done", "policy": at.row, "compared": comparison}
         else:
             yield {**ending, "became": "failed", "why": str(at)[:LONGEST_REASON]}
@@ -341,7 +334,7 @@ class _Served:
     policy: int
     version: int
     sha256: str
-    manifest: dict[str, Any]
+    manifest: PolicyManifest
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,14 +365,14 @@ def _measured(session: Session, learnt: Sequence[Learnt]) -> dict[str, _Measured
     by_policy = {one.policy: sha256 for sha256, one in served.items()}
     for policy, demonstration in session.execute(RESTS_ON, {"policies": [*by_policy]}):
         rests_on[by_policy[policy]].add(demonstration)
-    demos = taught(session, set().union(*(rests_on[sha256] for sha256 in served)))
+    demos = reference_paths(session, set().union(*(rests_on[sha256] for sha256 in served)))
     measured = {}
     for one in learnt:
         if (before := served.get(one.sha256)) is not None:
-            released = way_of(before.manifest, partial(_policy, session, before.policy))
-            trained = way_of(one.manifest, partial(unpack_as, Policy, one.policy))
+            released = policy_path(before.manifest, partial(_policy, session, before.policy))
+            trained = policy_path(one.manifest, partial(unpack_as, Policy, one.policy))
             same = [demo for row, demo in demos.items() if row in rests_on[one.sha256]]
-            measured[one.sha256] = _Measured(before, fit_of(released, trained, same))
+            measured[one.sha256] = _Measured(before, compare_paths(released, trained, same))
     return measured
 
 
@@ -391,9 +384,9 @@ def _still(measured: _Measured | None, served: _Served) -> bool:
     return measured is not None and measured.served.policy == served.policy
 
 
-def _kept(
+def _compared(
     session: Session, batch: _Batch, learnt: Learnt, stored: Stored, measured: _Measured | None
-) -> dict[str, Any]:
+) -> StoredComparison:
     """Return the comparison of a stored version with the released one; release it if requested and it is not worse."""
     trained = figures(stored.version, learnt.sha256, learnt.manifest)
     if measured is None:
@@ -403,22 +396,21 @@ def _kept(
         comparison = compare(figures(served.version, served.sha256, served.manifest), trained, measured.fit)
     if batch.request["release"]:
         comparison = _release(session, stored.row, comparison, batch.requested_by)
-    written: dict[str, Any] = as_json(comparison)
-    return written
+    return comparison
 
 
-def figures(version: int, sha256: str, manifest: dict[str, Any]) -> PolicyFigures:
+def figures(version: int, sha256: str, manifest: PolicyManifest) -> PolicyFigures:
     """Return the figures of a version that are compared; shares are of the path's states and of all states."""
-    metrics, coverage = manifest["metrics"], manifest["coverage"]
+    metrics, coverage = manifest.metrics, manifest.coverage
     return PolicyFigures(
         version=version,
         sha256=sha256,
-        demos=tuple(manifest["demos"]),
-        rests_on=len(manifest["demos"]),
-        dtw_total_mm=metrics["dtw_total_mm"],
-        exact_share=metrics["exact_states"] / metrics["path_states"],
-        reaching_share=coverage["starts_reaching_goal"] / coverage["n_states"],
-        mean_share=coverage["mean_share"],
+        demos=tuple(manifest.demos),
+        rests_on=len(manifest.demos),
+        dtw_total_mm=metrics.dtw_total_mm,
+        exact_share=metrics.exact_states / metrics.path_states,
+        reaching_share=coverage.starts_reaching_goal / coverage.n_states,
+        mean_share=coverage.mean_share,
     )
 
 
@@ -432,6 +424,7 @@ def compare(released: PolicyFigures | None, trained: PolicyFigures, fit: FitOnTh
         worse_because=() if released is None or fit is None else tuple(_worse(released, trained, fit)),
         now_released=False,
         not_released_because=None,
+        remedy=None,
     )
 
 
@@ -439,7 +432,7 @@ def _worse(released: PolicyFigures, trained: PolicyFigures, fit: FitOnTheSame) -
     """Yield the figures in which a new version is worse than the released one."""
     if not not_worse(fit):
         on = f"on the same {len(fit.demos)} demonstrations" if len(fit.demos) != 1 else "on the same demonstration"
-        yield f"DTW {shown_mm(fit.trained_mm)} mm against {shown_mm(fit.released_mm)} {on}"
+        yield f"DTW {format_mm(fit.trained_mm)} mm against {format_mm(fit.released_mm)} {on}"
     if not trained.rests_on >= released.rests_on:
         yield f"it was learnt from {trained.rests_on} of them, the released one from {released.rests_on}"
     if not trained.exact_share >= released.exact_share:
@@ -455,9 +448,12 @@ def _worse(released: PolicyFigures, trained: PolicyFigures, fit: FitOnTheSame) -
 def _release(session: Session, policy: int, comparison: StoredComparison, actor: str) -> StoredComparison:
     if comparison.worse_because:
         because = f"It is worse than the released version: {'; '.join(comparison.worse_because)}."
-        return replace(comparison, not_released_because=because)
-    try:
-        releases.release(session, session.get_one(PolicyVersion, policy), actor)
-    except Conflict as refused:
-        return replace(comparison, not_released_because=refused.words())
-    return replace(comparison, now_released=True)
+        advice = "Release it by its number if it is to replace the released version anyway."
+        return replace(comparison, not_released_because=because, remedy=advice)
+    made = releases.try_release(session, session.get_one(PolicyVersion, policy), actor)
+    return replace(
+        comparison,
+        now_released=made.released,
+        not_released_because=made.not_released_because,
+        remedy=made.remedy,
+    )

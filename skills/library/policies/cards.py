@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from pydantic import TypeAdapter
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -28,7 +29,7 @@ from skills.db.models import (
 from skills.db.packed import digest
 from skills.demonstration.demonstration import Demo
 from skills.errors import Corrupt
-from skills.fields import Point
+from skills.gridworld.domain import REACH
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import Coverage
@@ -38,7 +39,8 @@ from skills.library.people import consent
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import card_words as words
 from skills.library.policies import releases
-from skills.library.policies.versions import combined_of, learnt_from
+from skills.library.policies.card_words import sentence, sentences
+from skills.library.policies.combined import combined_of, learnt_from
 from skills.library.recordings.reports import full_report
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
@@ -64,10 +66,12 @@ from skills.schemas.cards import (
     StartShares,
     TipErrors,
 )
+from skills.schemas.demos import DemoReport
 from skills.schemas.people import SutureType
 from skills.transparency.notes import Note
 from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
+REPORT = TypeAdapter(DemoReport)
 FORMAT = 1  # of the JSON: raise it when a field is removed or changes its meaning
 
 
@@ -75,8 +79,7 @@ FORMAT = 1  # of the JSON: raise it when a field is removed or changes its meani
 class Card:
     """The facts of a policy version, and the demonstration, path and coverage that its pictures are drawn from.
 
-    In `facts`, the certificate and the reports are plain JSON, as it is stored, and not instances of their classes: an
-    older certificate has fewer fields, and the ETag is the digest of exactly these bytes.
+    The ETag is the digest of exactly the bytes of `facts`.
     """
 
     facts: PolicyCard
@@ -90,10 +93,6 @@ class Card:
         signed = head.checkpoint
         history = CardHistory(origin=signed.origin, size=signed.size, root=signed.root.hex(), note=head.text)
         return replace(self, facts=self.facts.model_copy(update={"history": history}))
-
-    def written(self) -> dict[str, Any]:
-        """Return the facts as plain values for JSON."""
-        return self.facts.model_dump(warnings=False)  # that the certificate and the reports are plain JSON
 
 
 def card_of(session: Session, version: PolicyVersion) -> Card:
@@ -110,12 +109,12 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
     # First, so that no fact is taken from a damaged row.
     _refuse_damaged([*recordings, *demonstrations, *rewards, version, *released])
     coverage, demo, combined = covered(version), learnt_from(version), _combined(version)
-    facts = PolicyCard.model_construct(  # not validated, which would add fields to an older certificate
+    facts = PolicyCard.model_construct(  # without the checkpoint of the history, see `Card.under`
         format=FORMAT,
         written_by=f"suture-skills {__version__}",
         title=f"{version.surgeon.slug}, {version.suture}, version {version.version}",
         use=words.USE,
-        what_it_is=words.IS if combined is None else words.of_several(len(demonstrations), combined.in_words),
+        what_it_is=sentences("introduction", len(demonstrations), combined and combined.in_words),
         what_it_is_not=words.IS_NOT,
         policy=_policy(version),
         status=_status(session, version, released),
@@ -125,7 +124,7 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
         combined=combined,
         learner=_learner(version),
         metrics=_metrics(version),
-        certificate=version.manifest["grid_certificate"],
+        certificate=version.manifest.grid_certificate,
         coverage=_coverage(version, coverage),
         limits=_limits(version, demo),
         lineage=_lineage(session, version),
@@ -150,7 +149,7 @@ def _refuse_damaged(rows: Sequence[Any]) -> None:
 
 
 def _policy(version: PolicyVersion) -> CardPolicy:
-    told = ("arm", "frame", "instrument", "grid", "start_mm", "goal_mm", "phases")
+    manifest = version.manifest
     return CardPolicy(
         sha256=version.sha256,
         version=version.version,
@@ -158,8 +157,14 @@ def _policy(version: PolicyVersion) -> CardPolicy:
         suture=version.suture,
         training=version.training,
         created_at=version.created_at,
-        **{name: version.manifest[name] for name in told},
-        n_states=version.manifest["coverage"]["n_states"],
+        arm=manifest.arm,
+        frame=manifest.frame,
+        instrument=manifest.instrument,
+        grid=manifest.grid,
+        start_mm=manifest.start_mm,
+        goal_mm=manifest.goal_mm,
+        phases=manifest.phases,
+        n_states=manifest.coverage.n_states,
         where=f"/policy-versions/{version.sha256}",
     )
 
@@ -169,8 +174,8 @@ def _status(session: Session, version: PolicyVersion, released: Sequence[Release
     serving = releases.served(session, version.surgeon, version.suture)
     served = None if serving is None else serving.policy
     # The certificate's reasons are final; the two below can arise after training.
-    refused = list(version.manifest["grid_certificate"]["refused_because"])
-    refused += [f"its demonstration {what}" for what in version.objections]
+    final = version.manifest.grid_certificate.refused_because
+    refused = [one.text for one in (*final, *releases.changed_demonstrations(version))]
     if not consent.may(version.surgeon, "training"):
         refused.append("the surgeon's consent no longer covers training")
     return CardStatus(
@@ -187,7 +192,7 @@ def _status(session: Session, version: PolicyVersion, released: Sequence[Release
             )
             for one in released
         ],
-        in_words=words.status(version.version, None if served is None else served.version, refused, bool(released)),
+        in_words=sentence("status", version.version, served and served.version, refused, bool(released)),
     )
 
 
@@ -198,19 +203,19 @@ def _surgeon(surgeon: Surgeon) -> CardSurgeon:
         handedness=surgeon.handedness,
         protocol=surgeon.protocol,
         consent=surgeon.consent,
-        consent_in_words=words.consent(surgeon.consent),
+        consent_in_words=sentence("consent", surgeon.consent),
     )
 
 
 def _demonstration(row: Demonstration) -> CardDemonstration:
     recording, report, path = row.recording, full_report(row), row.path
-    return CardDemonstration.model_construct(  # not validated, which would change the order of the report's fields
+    return CardDemonstration(
         sha256=row.sha256,
         state="active" if row.withdrawn_at is None else "withdrawn",
         withdrawn_at=row.withdrawn_at,
         outcome=row.outcome,
         outcome_reason=row.outcome_reason,
-        state_in_words=words.demonstration_state(row.withdrawn_at, row.outcome, row.outcome_reason),
+        state_in_words=sentence("demonstration_state", row.withdrawn_at, row.outcome, row.outcome_reason),
         arm=row.arm,
         topic=row.topic,
         frame=row.frame,
@@ -221,9 +226,9 @@ def _demonstration(row: Demonstration) -> CardDemonstration:
         hysteresis=path.hysteresis,
         path_states=len(path.states),
         created_at=row.created_at,
-        report=report,
-        quality_in_words=words.quality(report),
-        lost_in_words=words.lost(report),
+        report=REPORT.validate_python(report),
+        quality_in_words=sentences("quality", report),
+        lost_in_words=sentence("lost", report),
         where=f"/demos/{row.sha256}",
         recording=CardRecording(
             sha256=recording.sha256,
@@ -239,45 +244,33 @@ def _demonstration(row: Demonstration) -> CardDemonstration:
 
 def _combined(version: PolicyVersion) -> CardCombined | None:
     """Return how several demonstrations were combined into one path; None for a single demonstration."""
-    said = version.manifest.get("combined")
-    if said is None:
+    combined = version.manifest.combined
+    if combined is None:
         return None
-    return CardCombined(**said, in_words=words.combined(said, len(version.demonstrations)))
+    return CardCombined(**vars(combined), in_words=sentence("how_combined", combined, len(version.demonstrations)))
 
 
 def _learner(version: PolicyVersion) -> CardLearner:
     manifest = version.manifest
-    told = ("settings", "seed", "reward_levels", "training")
     return CardLearner(
-        kind=manifest["learner"],
-        version=manifest["learner_version"],
-        **{name: manifest[name] for name in told},
-        in_words=words.learner(
-            manifest["phases"],
-            manifest["training"]["settled"],
-            manifest.get("ties"),
-            manifest.get("outcomes"),
-            any(one.outcome is not None for one in version.demonstrations),
-        ),
+        kind=manifest.learner,
+        version=manifest.learner_version,
+        settings=manifest.settings,
+        seed=manifest.seed,
+        reward_levels=manifest.reward_levels,
+        training=manifest.training,
+        in_words=sentence("learner", manifest, any(one.outcome is not None for one in version.demonstrations)),
     )
 
 
 def _metrics(version: PolicyVersion) -> list[CardMetric]:
     """Return the metrics of a policy, each with its unit and the way it is measured."""
-    measured = version.manifest["metrics"]
+    measured = vars(version.manifest.metrics)
     return [
-        CardMetric(name, label, _value(measured[name]), unit.format(**measured), how.format(**measured))
+        CardMetric(name, label, measured[name], unit.format(**measured), how.format(**measured))
         for name, label, unit, how in words.METRICS
-        if measured.get(name) is not None
+        if measured[name] is not None
     ]
-
-
-def _value(stored: float | list[float]) -> float | Point:
-    """Return a metric of a manifest, whose JSON has three values as a list."""
-    if not isinstance(stored, list):
-        return stored
-    x, y, z = stored
-    return x, y, z
 
 
 def _coverage(version: PolicyVersion, coverage: Coverage) -> CardCoverage:
@@ -290,25 +283,24 @@ def _coverage(version: PolicyVersion, coverage: Coverage) -> CardCoverage:
     layers = tuple(StartLayer(*counts) for counts in zip(z_mm, *sums, strict=True))
     follow, reach_otherwise, do_not_reach = map(sum, sums)
     counts = StartCounts(follow=follow, reach_otherwise=reach_otherwise, do_not_reach=do_not_reach)
-    stated = version.manifest["coverage"]
-    scene, settings = version.manifest.get("scene"), version.manifest["settings"]
-    there = [] if scene is None else [words.in_scene(scene, settings["slip"])]
+    stated, scene = version.manifest.coverage, version.manifest.scene
+    there = [] if scene is None else [sentence("in_scene", scene, version.manifest.settings["slip"])]
     return CardCoverage(
-        **stated,
+        **vars(stated),
         **vars(counts),
         shares=StartShares(**{name: count / grid.n_states for name, count in vars(counts).items()}),
         layers=layers,
-        in_words=" ".join([words.coverage(counts, stated), *there]),
+        in_words=" ".join([sentence("coverage", counts, stated), *there]),
     )
 
 
 def _limits(version: PolicyVersion, demo: Demo) -> CardLimits:
     return CardLimits(
-        certified_domain=words.domain(version.manifest["phases"]),
-        joint_limits=words.joint_limits(version.manifest, demo.rotation_xyzw is not None),
-        tip_accuracy=words.tip_accuracy(),
+        certified_domain=sentence("domain", version.manifest.phases, REACH),
+        joint_limits=sentence("joint_limits", version.manifest, demo.rotation_xyzw is not None),
+        tip_accuracy=sentence("tip_accuracy", CALIBRATED_MM, UNCALIBRATED_MM),
         tip_error_mm=TipErrors(calibrated=CALIBRATED_MM, not_calibrated=UNCALIBRATED_MM),
-        not_checked=words.not_checked(version.manifest.get("scene")),
+        not_checked=words.not_checked(version.manifest.scene),
     )
 
 
@@ -325,7 +317,7 @@ def _lineage(session: Session, version: PolicyVersion) -> CardLineage:
     policy = learnt(version)
     links += [
         ("reward map", digest(sparse_reward(policy.path, policy.levels)), None),
-        ("policy", version.sha256, [version.manifest, digest(policy)]),
+        ("policy", version.sha256, [version.manifest.digested, digest(policy)]),
     ]
     return CardLineage(
         chain=[CardLink(what=what, sha256=sha256, how=words.DIGESTS[what], digest_of=of) for what, sha256, of in links],
@@ -342,4 +334,4 @@ def _resting_on(session: Session, version: PolicyVersion) -> RestingOnIt:
         "playbacks": session.scalar(played) or 0,
         "feasible_playbacks": session.scalar(played.where(StoredPlayback.feasible)) or 0,
     }
-    return RestingOnIt(**counts, in_words=words.resting(**counts))
+    return RestingOnIt(**counts, in_words=sentence("resting", counts))

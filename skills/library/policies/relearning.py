@@ -25,26 +25,19 @@ from skills.formats.parsed import ParsedContent
 from skills.gridworld.grid import GridPath, discretize
 from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import NearLimits, OddsLimits
-from skills.learning.policy import LEARNER_VERSION, Policy
+from skills.learning.policy import LEARNER_VERSION, Policy, describe_learner
 from skills.learning.tube import CertifiedPoses
 from skills.library.operation.integrity import learnt
 from skills.library.operation.jobs import TrainingRequest
 from skills.library.people.consent import refusal
-from skills.library.policies.training import (
-    ANY,
-    GATE_VERSION,
-    POSES_VERSION,
-    Learnt,
-    Lesson,
-    certified,
-    combined_lesson,
-    learn_style,
-    lessons,
-)
-from skills.library.policies.versions import combining_of
+from skills.library.policies.combined import combining_of
+from skills.library.policies.gate import GATE_VERSION, limits_of
+from skills.library.policies.learning import ANY, Learnt, Lesson, certified, combined_lesson, learn_style, lessons
+from skills.library.policies.training import POSES_VERSION
 from skills.library.recordings.content_cache import alike
 from skills.library.recordings.recordings import Parser, recording_bytes
 from skills.packing import canonical
+from skills.schemas.policies import PolicyManifest
 from skills.settings import Settings
 
 NUMBERS = "its values"
@@ -197,7 +190,7 @@ class _Stored:
     """A stored version with the request of which it is the result."""
 
     sha256: str
-    manifest: dict[str, Any]
+    manifest: PolicyManifest
     policy: Policy
     request: TrainingRequest
 
@@ -208,8 +201,8 @@ class _Stored:
 
     def lesson(self, found: list[Lesson]) -> Lesson:
         """Return what the version was learnt from, with the outcomes that its demonstrations had then."""
-        combined, outcomes = self.manifest.get("combined"), self.manifest.get("outcomes")
-        lesson = found[0] if combined is None else combined_lesson(found, combining_of(combined))
+        combined, outcomes = self.manifest.combined, self.manifest.outcomes
+        lesson = found[0] if combined is None else combined_lesson(found, combining_of(combined.kind))
         return lesson if outcomes is None else replace(lesson, outcomes=tuple(outcomes))
 
     def differing(self, made: Learnt, *, numbers_only: bool = False) -> tuple[str, ...]:
@@ -217,54 +210,50 @@ class _Stored:
         if made.sha256 == self.sha256:
             return ()
         equal = digest(unpack_as(Policy, made.policy)) == digest(self.policy)
-        fields = () if numbers_only else _unequal(self.manifest, made.manifest)
+        fields = () if numbers_only else _unequal(self.manifest.digested, made.manifest.digested)
         return (*(() if equal else (NUMBERS,)), *fields)
 
 
-def request_of(manifest: dict[str, Any], policy: Policy) -> TrainingRequest:
+def request_of(manifest: PolicyManifest, policy: Policy) -> TrainingRequest:
     """Return the request of which a version is the result, as `training.request_training` writes it."""
     request: TrainingRequest = {
-        "surgeon": manifest["surgeon"],
-        "suture": manifest["suture"],
-        "demos": manifest["demos"],
-        "learner": {"kind": manifest["learner"], **manifest["settings"]},
+        "surgeon": manifest.surgeon,
+        "suture": manifest.suture,
+        "demos": manifest.demos,
+        "learner": describe_learner(manifest.learnt_with),
         "learner_version": LEARNER_VERSION,
         "gate": GATE_VERSION,
         "poses": POSES_VERSION,
-        "near": _limits(NearLimits, manifest["grid_certificate"]["near"]),
-        "seed": manifest["seed"],
+        "near": asdict(limits_of(NearLimits, manifest.grid_certificate.near)),
+        "seed": manifest.seed,
         "release": False,
     }
-    if "combined" in manifest:
-        request["combine"] = {"kind": manifest["combined"]["kind"]}
-    if "outcomes" in manifest:
+    if manifest.combined is not None:
+        request["combine"] = {"kind": manifest.combined.kind}
+    if manifest.outcomes is not None:
         request["outcomes"] = ANY
     if policy.ties is not None and policy.ties.depth_along is not None:
         request["depth_along"] = [*policy.ties.depth_along]
-    if policy.surroundings is not None:
+    if policy.surroundings is not None and manifest.scene is not None:
         request["surroundings"] = policy.surroundings.as_json()
-        request["odds"] = _limits(OddsLimits, manifest["scene"]["near"])
+        request["odds"] = asdict(limits_of(OddsLimits, manifest.scene.near))
     return request
 
 
-def _limits(of: type[NearLimits] | type[OddsLimits], said: dict[str, Any]) -> dict[str, float]:
-    return {name: said[name] for name in asdict(of())}
-
-
 def _other_gate(version: PolicyVersion) -> str | None:
-    gate = version.manifest["grid_certificate"]["gate"]
+    gate = version.manifest.grid_certificate.gate
     return None if gate == GATE_VERSION else f"checked by another release gate (version {gate}, now {GATE_VERSION})"
 
 
 def _other_learner(version: PolicyVersion) -> str | None:
-    made = version.manifest["learner_version"]
+    made = version.manifest.learner_version
     age = "an older" if made < LEARNER_VERSION else "a newer"
     return None if made == LEARNER_VERSION else f"made by {age} learner (version {made}, now {LEARNER_VERSION})"
 
 
 def _other_demos(version: PolicyVersion) -> str | None:
     """Return that the row has other demonstrations than its manifest, which `verify` reports with the row."""
-    if version.manifest["demos"] == [one.sha256 for one in version.demonstrations]:
+    if version.manifest.demos == [one.sha256 for one in version.demonstrations]:
         return None
     return "stored with other demonstrations than its manifest names"
 

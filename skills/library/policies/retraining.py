@@ -8,28 +8,37 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import orjson
 from sqlalchemy import ColumnElement, Text, cast, func, insert, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import now, rfc3339
+from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.learning.certificate import NearLimits, OddsLimits
-from skills.learning.policy import LEARNER_VERSION, describe_learner
+from skills.learning.policy import LEARNER_VERSION, describe_learner, learner_of
 from skills.library.operation import jobs, locks
-from skills.library.operation.jobs import BATCH, KEPT, PART, PartRequest, RequestedJob, RetrainingRequest, did_nothing
+from skills.library.operation.jobs import (
+    BATCH,
+    JOIN_AS_SERVED,
+    PART,
+    PartRequest,
+    RequestedJob,
+    RetrainingRequest,
+    did_nothing,
+)
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
-from skills.library.policies.releases import Outcome
-from skills.library.policies.training import GATE_VERSION, POSES_VERSION, learner_to_train
-from skills.library.policies.versions import Kept, Recipe, in_pieces, kept_of, learner_kept, recipes_of
+from skills.library.policies.gate import GATE_VERSION, limits_of
+from skills.library.policies.outcomes import Style
+from skills.library.policies.served_settings import ServedSettings, in_pieces, learner_for, settings_of_served
+from skills.library.policies.training import POSES_VERSION, learner_to_train
 from skills.library.recordings.demos import newest_demos
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
+from skills.schemas.policies import PolicyManifest
 from skills.schemas.training import RetrainingIn
 
 MOST_IN_A_PART = 50  # styles: the engine's overhead for a part, some 30 ms, is then spread over a second of work
@@ -135,29 +144,26 @@ def choose_styles(
         "poses": POSES_VERSION,
         "near": asdict(near or NearLimits()),
         "odds": asdict(odds or OddsLimits()),
-        "joins": KEPT if batch.chosen is None else None,
+        "joins": JOIN_AS_SERVED if batch.chosen is None else None,
         "seed": 0,
         "release": batch.release,
     }
-    kept = kept_of(session, None if who is None else [who.row])
-    if batch.chosen is not None:
-        kept.rules.clear()
-    stale = _reasons(session, demos, asked, kept, who, what)
+    served = settings_of_served(session, None if who is None else [who.row])
+    stale = _reasons(session, demos, asked, served, who, what)
     chosen = [demo for demo in demos if stale[demo.row] or not batch.only_stale]
-    request, unsettled = _unsettled(session, asked, chosen, kept)
+    request, unsettled = _unsettled(session, asked, chosen, served)
     return request, [{"demonstration_row": demo.row, "stale": stale[demo.row]} for demo in unsettled]
 
 
 def _unsettled(
-    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], kept: Kept
+    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], served: dict[Style, ServedSettings]
 ) -> tuple[RetrainingRequest, Sequence["_Newest"]]:
     """Return the request to make, and its styles; if an equal batch is done, only the styles that it would now release.
 
     `after` names that batch, so that the request differs from it, while a repetition of the request does not differ.
     """
-    recipes = recipes_of(session, None if asked["surgeon"] is None else {demo.surgeon_row for demo in chosen})
     while True:
-        digest = sha256(canonical([_made_of(session, demo, recipes, kept) for demo in chosen]))
+        digest = sha256(canonical([_made_of(session, demo, served.get(demo.style), asked) for demo in chosen]))
         request: RetrainingRequest = {**asked, "styles": len(chosen), "demos_sha256": digest}
         known = jobs.find_live(session, BATCH, request)
         if known is None or known.state != "succeeded" or not asked["release"]:
@@ -169,19 +175,16 @@ def _unsettled(
         asked = {**asked, "after": known.id}
 
 
-def _made_of(
-    session: Session,
-    demo: "_Newest",
-    recipes: dict[tuple[int, str], Recipe],
-    kept: Kept,
-) -> list[Any]:
+def _made_of(session: Session, demo: "_Newest", served: ServedSettings | None, asked: RetrainingRequest) -> list[Any]:
     """Return the combination of a style, the digests of its newest demonstrations, its rule and its scene."""
-    style = demo.surgeon_row, demo.suture
-    kind, demos, there = None, [demo.sha256], kept.scenes.get(style)
-    if (recipe := recipes.get(style)) is not None:
-        kind, newest = recipe.how.kind, newest_demos(session, demo.surgeon_row, demo.suture, recipe.demos)
+    if served is None:
+        return [None, [demo.sha256], None, None]
+    kind, demos = None, [demo.sha256]
+    if served.combining is not None:
+        kind, newest = served.combining.kind, newest_demos(session, demo.surgeon_row, demo.suture, served.demos)
         demos = [one.sha256 for one in newest]
-    return [kind, demos, kept.rules.get(style), None if there is None else there.surroundings]
+    rule = served.join_share if asked["joins"] == JOIN_AS_SERVED else None
+    return [kind, demos, rule, None if served.surroundings is None else served.surroundings.as_json()]
 
 
 def _did_nothing(session: Session, job: Job) -> str:
@@ -199,6 +202,11 @@ class _Newest:
     sha256: str
     surgeon_row: int
     suture: str
+
+    @property
+    def style(self) -> Style:
+        """The surgeon's row, and the suture type."""
+        return self.surgeon_row, self.suture
 
 
 def _newest_demos(session: Session, surgeon: Surgeon | None, suture: SutureType | None) -> list[_Newest]:
@@ -221,7 +229,7 @@ def _reasons(
     session: Session,
     demos: Sequence[_Newest],
     asked: RetrainingRequest,
-    kept: Kept,
+    served: dict[Style, ServedSettings],
     surgeon: Surgeon | None,
     suture: SutureType | None,
 ) -> dict[int, list[str]]:
@@ -237,27 +245,24 @@ def _reasons(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
     )
-    of_style = {(demo.surgeon_row, demo.suture): demo for demo in demos}
+    of_style = {demo.style: demo for demo in demos}
     reasons = {demo.row: ["never trained"] for demo in demos}
     for who, what, releasable, text in in_pieces(session, query):
         demo = of_style.get((who, what))
         if demo is None:
             continue
-        about = orjson.loads(text)
-        scene, certificate = about.get("scene") or {}, about["grid_certificate"]
-        there = kept.scenes.get((who, what))
-        learner = learner_kept(asked, kept.rules.get((who, what)), there)
-        settings = {name: value for name, value in learner.items() if name != "kind"}
-        how = about["learner"], about["settings"], about["seed"]
-        place = scene.get("sha256"), scene.get("costs")
+        manifest, kept = PolicyManifest.model_validate_json(text), served.get((who, what))
+        certificate, near = manifest.grid_certificate, NearLimits(**asked["near"])
+        learner = learner_of(learner_for(asked, kept))
+        odds = None if manifest.scene is None else manifest.scene.near
         found = {
-            "a newer demonstration": demo.sha256 not in about["demos"],
-            "another scene": place != ((there.sha256, there.surroundings["costs"]) if there else (None, None)),
-            "other settings": how != (learner["kind"], settings, asked["seed"]),
-            "a newer learner": about["learner_version"] != asked["learner_version"],
-            "refused by an older gate": not releasable and certificate["gate"] != asked["gate"],
-            "other limits at the near starts": not asked["near"].items() <= certificate["near"].items()
-            or (bool(scene) and not asked["odds"].items() <= scene["near"].items()),
+            "a newer demonstration": demo.sha256 not in manifest.demos,
+            "another scene": manifest.surroundings != (None if kept is None else kept.surroundings),
+            "other settings": (manifest.learnt_with, manifest.seed) != (learner, asked["seed"]),
+            "a newer learner": manifest.learner_version != asked["learner_version"],
+            "refused by an older gate": not releasable and certificate.gate != asked["gate"],
+            "other limits at the near starts": limits_of(NearLimits, certificate.near) != near
+            or (odds is not None and limits_of(OddsLimits, odds) != OddsLimits(**asked["odds"])),
         }
         reasons[demo.row] = [reason for reason, holds in found.items() if holds]
     return reasons
@@ -314,20 +319,3 @@ def list_styles(
     of = StyleToRetrain
     query = select(of).where(of.job_row == job.row, of.row > (after or 0)).order_by(of.row).limit(limit)
     return session.scalars(query if state is None else query.where(of.state == state)).all()
-
-
-def retrained_json(row: StyleToRetrain, outcome: Outcome) -> dict[str, Any]:
-    """Return the JSON of one style of a batch of retrainings."""
-    return {
-        "surgeon": row.demonstration.surgeon.slug,
-        "suture": row.demonstration.suture,
-        "demo": row.demonstration.sha256,
-        "stale_because": row.stale,
-        "state": row.state,
-        "reason": row.reason,
-        "policy_version": row.policy and row.policy.version,
-        "sha256": row.policy and row.policy.sha256,
-        "comparison": outcome.result,
-        "served": outcome.served,
-        "ended_at": rfc3339(row.ended_at),
-    }

@@ -9,118 +9,51 @@ Learning and certifying run outside any transaction; the result is packed before
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple, cast
+from dataclasses import asdict
+from typing import Any
 
-import numpy as np
-from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
-from skills.comparison.combining import Combining, followed
 from skills.db.models import (
-    SUCCESS,
-    Demonstration,
-    LastUsed,
-    PolicyDemonstration,
     PolicyVersion,
-    StoredPoses,
-    StoredRecording,
-    StoredRewardMap,
     Surgeon,
-    newest_mark,
 )
-from skills.db.packed import Sealed, seal, unpack_as
-from skills.db.service_tables import Job, record_events
+from skills.db.service_tables import Job
 from skills.db.session import Database
-from skills.deep import Progress as Tell
-from skills.deep import learn_policy, require_installed
-from skills.demonstration.demonstration import Demo, partner_motion
-from skills.demonstration.partner import PartnerMotion
-from skills.demonstration.recording import Recording
-from skills.errors import BadInput, Conflict, NotFound, SkillsError
-from skills.fields import as_json
-from skills.gridworld.grid import discretisation_rmse
-from skills.gridworld.hazards import Surroundings, hazards_of, refuse_unfit
-from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
+from skills.deep import require_installed
+from skills.errors import BadInput
+from skills.gridworld.hazards import refuse_unfit
+from skills.gridworld.reward import RewardLevels
 from skills.learning.certificate import (
-    Certificate,
     NearLimits,
-    NearOdds,
-    NearStarts,
     OddsLimits,
-    certify,
-    near_odds,
-    near_starts,
 )
-from skills.learning.evaluation import check_in_space, measure
-from skills.learning.in_scene import SceneCertificate, certify_in_scene, learn_in_scene, scene_learner
+from skills.learning.in_scene import scene_learner
 from skills.learning.policy import (
     LEARNER_VERSION,
     Learner,
-    Policy,
     describe_learner,
-    describe_settings,
-    learner_of,
     refuse_loops,
     refuse_too_large,
 )
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.ties import rule_in
-from skills.learning.tube import certified_poses
 from skills.library.operation import jobs
-from skills.library.operation.integrity import poses_identity_of, scene_digest
 from skills.library.operation.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
-from skills.library.people.consent import refusal, require
+from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
-from skills.library.policies.releases import driven_or_refused, refusals
-from skills.library.policies.versions import BEST, choose_demos, combining_of, describe_combined, find_by_digest
+from skills.library.policies.combined import BEST, choose_demos, combining_of
+from skills.library.policies.gate import GATE_VERSION
+from skills.library.policies.learning import ANY, combined_lesson, learn_style, lessons, store_style, with_partners
+from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import find_demo
-from skills.library.recordings.recordings import Parser, confined_reader, stored_recording
-from skills.packing import canonical, sha256
-from skills.planning.plan import DrivenPass
-from skills.remedies import Action, Remedy
-from skills.schemas.policies import JOINING_FORMAT, Coverage, GridCertificate, Joining
-from skills.schemas.policy_document import policy_identity_of
-from skills.schemas.training import TrainingIn
+from skills.library.recordings.recordings import confined_reader
+from skills.schemas.training import TrainingIn, TrainingResult
 from skills.settings import Settings
 
-# Statements executed for every style, built once: building one takes as long as executing it.
-_VERSIONS, _DEMOS, _SURGEONS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration, Surgeon))
-_OF_STYLE, _USED = _VERSIONS.alias("of_style"), cast(Table, LastUsed.__table__)
-STANDING = (
-    select(
-        _DEMOS.c.row,
-        _DEMOS.c.withdrawn_at,
-        newest_mark("outcome", _DEMOS.c.row).label("outcome"),
-        _SURGEONS.c.slug,
-        _SURGEONS.c.consent,
-        select(func.max(_OF_STYLE.c.version))
-        .where(_OF_STYLE.c.surgeon_row == _DEMOS.c.surgeon_row, _OF_STYLE.c.suture == _DEMOS.c.suture)
-        .scalar_subquery()
-        .label("last"),
-        select(func.max(_USED.c.last))
-        .where(_USED.c.surgeon_row == _DEMOS.c.surgeon_row, _USED.c.suture == _DEMOS.c.suture)
-        .scalar_subquery()
-        .label("used"),
-    )
-    .join_from(_DEMOS, _SURGEONS, _SURGEONS.c.row == _DEMOS.c.surgeon_row)
-    .where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
-)
-KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
-    _VERSIONS.c.sha256.in_(bindparam("digests", expanding=True))
-)
-ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
-ERASED = "A demonstration was erased while the training used it."
-ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
 POSES_VERSION = 1  # part of a training's identity: raise it when equal demonstrations give another pose style
-GATE_VERSION = 1  # part of a training's identity: raise it when the gate's result for an equal policy changes
-CERTIFICATE_NOTE = (
-    "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
-    "the demonstrated pass as it is driven (`driven.path`) against the arm's joint limits in closed form. It says "
-    "nothing about the arm's accuracy. Research use only."
-)
 
 
 def request_training(
@@ -242,69 +175,16 @@ def _refuse_depth_along(depth_along: Sequence[float], learner: Learner, frame: s
 def _release_again(session: Session, job: Job, actor: str) -> str:
     """Release the version of a finished training unless its style serves it already; return the effect in words."""
     assert job.result is not None, "it has succeeded"
-    version = find_by_digest(session, job.result["sha256"])
+    result = TrainingResult.model_validate(job.result)
+    version = find_by_digest(session, result.sha256)
     served = releases.served(session, version.surgeon, version.suture)
     if served is not None and served.policy_row == version.row:
         return f"Nothing: the style serves version {version.version} already."
-    because = _release(session, version, actor)
-    job.result = job.result | {"released": because is None, "not_released_because": because}
+    released = releases.try_release(session, version, actor)
+    job.result = result.model_copy(update=released._asdict()).model_dump()
     session.flush()
+    because = released.not_released_because
     return f"Version {version.version} was released." if because is None else f"Nothing: {because}"
-
-
-def _release(session: Session, version: PolicyVersion, actor: str) -> str | None:
-    """Release a version; return None, or the reason why it was refused."""
-    try:
-        releases.release(session, version, actor)
-    except Conflict as refused:
-        return refused.words()
-    return None
-
-
-@dataclass(frozen=True, eq=False)
-class Lesson:
-    """A demonstration to learn from, its values still packed, with its surgeon.
-
-    For several combined demonstrations it is the one at whose place their path lies; `others` are the rows of the rest,
-    and `combined` is the description of the combination in the manifest. `outcomes` are those of all its
-    demonstrations, the oldest first; None is not known. `shown` are these demonstrations, still packed, and `at` is the
-    index of the one at whose place they lie; empty for a single one. `partners` is the other arm's motion along each of
-    them (`with_partners`), and `recording` the digest of the recording of a single one.
-    """
-
-    row: int
-    sha256: str
-    surgeon: Surgeon
-    suture: str
-    demo: bytes
-    reward: bytes
-    outcomes: tuple[str | None, ...]
-    recording: str
-    partners: tuple[PartnerMotion | None, ...] = (None,)
-    others: tuple[int, ...] = ()
-    combined: dict[str, Any] | None = None
-    shown: tuple[bytes, ...] = ()
-    at: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Learnt:
-    """A learnt and certified policy, already packed, so that no transaction has to wait for the packing."""
-
-    lesson: Lesson
-    training: str
-    sha256: str
-    manifest: dict[str, Any]
-    policy: bytes
-    coverage: bytes
-    poses: Sealed | None
-
-
-class Stored(NamedTuple):
-    """The row and the version number of a stored policy."""
-
-    row: int
-    version: int
 
 
 def train_style(database: Database, request: TrainingRequest, settings: Settings) -> Store:
@@ -314,352 +194,18 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if a recording is not cached
         found = with_partners(database, found, reader.parse)
-    lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
+    lesson = combined_lesson(found, combining_of(request["combine"]["kind"])) if "combine" in request else found[0]
     learnt = learn_style(lesson, request, settings, jobs.progress_callback(database, "training", request))
 
     def store(session: Session, actor: str) -> dict[str, Any]:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)
-        because = _release(session, version, actor) if request["release"] else None
-        return {
-            "policy_version": version.version,
-            "sha256": version.sha256,
-            "releasable": version.releasable,
-            "released": request["release"] and because is None,
-            "not_released_because": because,
-        }
+        wanted = request["release"]
+        released = releases.try_release(session, version, actor) if wanted else releases.NOT_REQUESTED
+        return TrainingResult(
+            policy_version=version.version,
+            sha256=version.sha256,
+            releasable=version.releasable,
+            **released._asdict(),
+        ).model_dump()
 
     return store
-
-
-def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
-    """Return the lessons of some demonstrations, in the order of the rows."""
-    of = Demonstration
-    packed = type_coerce(of.demo, LargeBinary), type_coerce(StoredRewardMap.map, LargeBinary)
-    query = (
-        select(of.row, of.sha256, Surgeon, of.suture, *packed, of.outcome, StoredRecording.sha256)
-        .join(Surgeon, Surgeon.row == of.surgeon_row)
-        .join(StoredRecording, StoredRecording.row == of.recording_row)
-        .join(StoredRewardMap, StoredRewardMap.demonstration_row == of.row)
-        .where(of.row.in_(demonstrations))
-    )
-    found = session.execute(query.order_by(of.row))
-    return [
-        Lesson(row, sha256, surgeon, suture, demo, reward, (outcome,), recording)
-        for row, sha256, surgeon, suture, demo, reward, outcome, recording in found
-    ]
-
-
-def with_partners(database: Database, lessons: Sequence[Lesson], tell: Parser) -> list[Lesson]:
-    """Return lessons of one style with the other arm's motion along each demonstration, if every one has it.
-
-    It is computed from the recordings, because a demonstration has only the pose in which the other arm takes the
-    needle. A recording that cannot be read refuses the training: an equal one would have another result elsewhere.
-
-    Args:
-        database: The database; no transaction is open while a recording is read.
-        lessons: At least one, none of them combined.
-        tell: The reader of recordings that are not cached.
-
-    Raises:
-        Conflict: The surgeon's consent does not cover training.
-        NotFound: A demonstration was erased since.
-        Corrupt: A value does not match its digest.
-        BadRecording: A recording is not cached, and cannot be read any more.
-    """
-    require(lessons[0].surgeon, "training")  # before a recording is read
-    demos = [unpack_as(Demo, one.demo) for one in lessons]
-    arms = {None if demo.partner is None or demo.rotation_xyzw is None else demo.partner.arm for demo in demos}
-    if len(arms) > 1 or None in arms:
-        return [*lessons]
-    found: list[Lesson] = []
-    recording: Recording | None = None
-    for number, (lesson, demo) in enumerate(zip(lessons, demos, strict=True)):
-        if recording is None or lesson.recording != lessons[number - 1].recording:
-            recording = None  # before the next one is read, so that only one is in memory
-            try:
-                recording = stored_recording(database, lesson.recording, tell).recording
-            except NotFound:
-                raise NotFound(ERASED) from None
-        motion = partner_motion(recording, demo)
-        if motion is None:
-            return [*lessons]
-        found.append(replace(lesson, partners=(motion,)))
-    return found
-
-
-def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
-    """Combine the lessons of one style, the oldest first, into one.
-
-    Raises:
-        Corrupt: A demonstration does not match its digest.
-        BadPath: They cannot be aligned, or their combined path has no path in the grid.
-    """
-    rewards = [unpack_as(RewardMap, lesson.reward) for lesson in lessons]
-    found = followed([unpack_as(Demo, one.demo) for one in lessons], [reward.path for reward in rewards], how)
-    at = found.combined.at
-    return replace(
-        lessons[at],
-        demo=seal(found.demo).packed,
-        reward=seal(sparse_reward(found.path, rewards[at].levels)).packed,
-        outcomes=tuple(outcome for lesson in lessons for outcome in lesson.outcomes),
-        shown=tuple(lesson.demo for lesson in lessons),
-        partners=tuple(partner for lesson in lessons for partner in lesson.partners),
-        at=at,
-        others=tuple(lesson.row for lesson in lessons if lesson is not lessons[at]),
-        combined=describe_combined(found, how, [lesson.sha256 for lesson in lessons]),
-    )
-
-
-def learn_style(lesson: Lesson, request: TrainingRequest, settings: Settings, tell: Tell | None = None) -> Learnt:
-    """Learn, certify and measure a style from a lesson, as a training requests it; no transaction is open.
-
-    Args:
-        lesson: The demonstration.
-        request: The training's request, as `request_training` writes it.
-        settings: Limits of time and memory.
-        tell: Progress callback.
-
-    Raises:
-        LearningFailed: The process of a deep learner crashed or exceeded its limits.
-        Conflict: The surgeon's consent does not cover it.
-        Corrupt: The demonstration does not match its digest.
-        BadSettings: It cannot be learnt with these settings.
-    """
-    require(lesson.surgeon, "training")  # fails early; the check that counts is repeated in the transaction that stores
-    demo, reward = unpack_as(Demo, lesson.demo), unpack_as(RewardMap, lesson.reward)
-    learner = learner_of(request["learner"])
-    if "surroundings" in request:
-        given = Surroundings.of_json(request["surroundings"])
-        hazards = hazards_of(given.scene, reward.path, demo.frame, given.costs)
-        policy = learn_in_scene(reward, scene_learner(learner), hazards, request["seed"])
-        return certified(lesson, request, demo, policy)
-    policy = learn_policy(
-        reward,
-        learner,
-        request["seed"],
-        ties=rule_in(demo.frame, request.get("depth_along")),
-        progress=tell,
-        timeout_s=settings.learning_timeout_s,
-        memory_bytes=settings.learning_memory_bytes,
-    )
-    return certified(lesson, request, demo, policy)
-
-
-def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Policy) -> Learnt:
-    """Certify and measure a policy that was learnt from a demonstration, and pack all of it."""
-    certificate, covered = certify(policy)
-    in_scene = None
-    if policy.hazards is not None:
-        in_scene, odds = certify_in_scene(policy, policy.hazards)
-        covered = replace(covered, finishing=odds.finishes, touching=odds.touches)
-    shown = [unpack_as(Demo, one) for one in lesson.shown] or [demo]
-    poses = certified_poses(shown, lesson.at, partners=lesson.partners)
-    numbers, coverage = seal(policy), seal(covered)
-    driven, undriven = driven_or_refused(policy, demo)
-    limits = NearLimits(**request["near"])
-    near = near_starts(policy, covered.share, limits)
-    chances = None if in_scene is None else near_odds(policy, covered, limits, OddsLimits(**request["odds"]))
-    refused_because = [*refusals(policy, certificate, near, chances), *undriven]
-    manifest = describe_policy(policy, certificate, near, coverage.digest, demo, request, refused_because, driven)
-    if policy.surroundings is not None and in_scene is not None and chances is not None:
-        manifest["scene"] = describe_scene(policy.surroundings, in_scene, chances)
-    if lesson.combined is not None:
-        manifest["combined"] = lesson.combined
-    if request.get("outcomes") == ANY:  # left out otherwise: then none of them is marked recovery or failure
-        manifest["outcomes"] = [*lesson.outcomes]
-    return Learnt(
-        lesson=lesson,
-        training=sha256(canonical(request)),
-        sha256=policy_identity_of(manifest, numbers.digest),
-        manifest=manifest,
-        policy=numbers.packed,
-        coverage=coverage.packed,
-        poses=None if poses is None else seal(poses),
-    )
-
-
-def store_style(session: Session, learnt: Learnt) -> Stored:
-    """Store a learnt policy as the next version of its style; an equal one is not stored twice.
-
-    Raises:
-        NotFound: A demonstration was erased since.
-        Conflict: A demonstration was withdrawn since, or marked recovery or failure without a training from any
-            outcome; or the surgeon's consent does not cover training any more.
-    """
-    (stored,) = store_styles(session, [learnt])
-    if isinstance(stored, SkillsError):
-        raise stored
-    return stored
-
-
-def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | SkillsError]:
-    """Store learnt policies of different styles, as `store_style` does, with a few statements for all of them.
-
-    Returns:
-        For each, in order, the stored version, or the error for which it was not stored.
-    """
-    standing = {one.row: one for one in session.execute(STANDING, {"demonstrations": [o.lesson.row for o in learnt]})}
-    known = _stored(session.execute(KNOWN, {"digests": [one.sha256 for one in learnt]}))
-    refused = {one.sha256: _refusal(session, one, standing.get(one.lesson.row)) for one in learnt}
-    # A version that is already stored is returned as it is, so a retry of a job stores nothing twice.
-    new = [one for one in learnt if one.sha256 not in known and refused[one.sha256] is None]
-    if new:
-        of_style = [standing[one.lesson.row] for one in new]
-        values = [_version(one, max(of.last or 0, of.used or 0) + 1) for one, of in zip(new, of_style, strict=True)]
-        known |= _stored(session.execute(ADD, values))
-        record_events(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
-    rests_on = [
-        {"policy_row": known[one.sha256].row, "demonstration_row": other} for one in new for other in one.lesson.others
-    ]
-    if rests_on:
-        session.execute(insert(PolicyDemonstration), rests_on)
-    poses = [
-        {"policy_row": known[one.sha256].row, "poses": one.poses.packed}
-        | {"sha256": poses_identity_of(one.sha256, one.poses.digest)}
-        for one in new
-        if one.poses is not None
-    ]
-    if poses:
-        session.execute(insert(StoredPoses), poses)
-    return [refused[one.sha256] or known[one.sha256] for one in learnt]
-
-
-def _stored(found: Result[Any]) -> dict[str, Stored]:
-    return {one.sha256: Stored(one.row, one.version) for one in found}
-
-
-def _refusal(session: Session, learnt: Learnt, standing: Any) -> SkillsError | None:
-    """Return the error that forbids storing.
-
-    A demonstration was erased, withdrawn or marked since, or consent has ended.
-    """
-    others = [session.get(Demonstration, row) for row in learnt.lesson.others]
-    if standing is None or None in others:
-        return NotFound(ERASED)
-    if any(one.withdrawn_at is not None for one in (standing, *others)):
-        return Conflict("A demonstration was withdrawn while the training used it.")
-    marked = [one.outcome for one in (standing, *others) if one.outcome not in (None, SUCCESS)]
-    if marked and "outcomes" not in learnt.manifest:
-        why = f"A demonstration was marked {marked[0]} while the training used it."
-        return Conflict(why, Remedy(Action.TRAIN_ANY))
-    return refusal(standing, "training")
-
-
-def _version(learnt: Learnt, version: int) -> dict[str, Any]:
-    """Return the values of a row of `PolicyVersion`."""
-    return {
-        "sha256": learnt.sha256,
-        "training": learnt.training,
-        "surgeon_row": learnt.lesson.surgeon.row,
-        "suture": learnt.lesson.suture,
-        "version": version,
-        "demonstration_row": learnt.lesson.row,
-        "manifest": learnt.manifest,
-        "releasable": not learnt.manifest["grid_certificate"]["refused_because"],
-        "learnt": learnt.policy,
-        "covered": learnt.coverage,
-    }
-
-
-def describe_policy(
-    policy: Policy,
-    certificate: Certificate,
-    near: NearStarts,
-    coverage_sha256: str,
-    demo: Demo,
-    request: TrainingRequest,
-    refused_because: list[str],
-    driven: DrivenPass | None,
-) -> dict[str, Any]:
-    """Return the manifest of a policy: the JSON of `schemas.policies.Policy` without version, digest, release, arrays.
-
-    Args:
-        policy: The policy.
-        certificate: The certificate of its grid.
-        near: The starts near the demonstrated one.
-        coverage_sha256: The digest of its coverage.
-        demo: The demonstration that it was learnt from.
-        request: The training's request.
-        refused_because: The reasons against a release; empty if there are none.
-        driven: The demonstrated pass as the arm drives it; None if it could not be solved.
-    """
-    path, grid = policy.path, policy.path.grid
-    wandered = check_in_space(policy)
-    lost_mm = discretisation_rmse(demo.tip_mm, grid, path.hysteresis)
-    metrics = measure(policy.replay, lost_mm)
-    return {
-        "surgeon": request["surgeon"],
-        "suture": request["suture"],
-        "arm": demo.arm,
-        "frame": demo.frame,
-        "instrument": demo.instrument,
-        "grid": describe_grid(policy),
-        "start_mm": path.tip_mm[0].tolist(),
-        "goal_mm": path.tip_mm[-1].tolist(),
-        "waypoints": path.states.tolist(),
-        "phases": policy.domain.phases,
-        "learner": policy.learner.kind,
-        "learner_version": request["learner_version"],
-        "settings": describe_settings(policy.learner),
-        "reward_levels": as_json(policy.levels),
-        "seed": policy.seed,
-        "demos": request["demos"],
-        "training": as_json(policy.training),
-        "metrics": as_json(metrics),
-        "coverage": as_json(
-            Coverage(
-                starts_reaching_goal=certificate.starts_reaching,
-                starts_joining_nearest=certificate.starts_joining_nearest,
-                n_states=certificate.starts,
-                sha256=coverage_sha256,
-                mean_share=certificate.mean_share,
-                median_share=certificate.median_share,
-                starts_goal_alone=certificate.starts_goal_alone,
-            )
-        ),
-        "grid_certificate": as_json(
-            GridCertificate(
-                states_checked=certificate.checked,
-                states_finishing=certificate.finishing,
-                suboptimal_actions=certificate.suboptimal,
-                actions_off_rule=certificate.off_rule,
-                demonstration_reproduced=certificate.demonstration_reproduced,
-                refused_because=tuple(refused_because),
-                gate=GATE_VERSION,
-                near=near,
-                driven=driven,
-                note=CERTIFICATE_NOTE,
-            )
-        ),
-        **({} if wandered is None else {"rollouts": as_json(wandered)}),
-        **joining_of(policy),
-        **({} if policy.ties is None else {"ties": as_json(policy.ties)}),
-    }
-
-
-def describe_scene(surroundings: Surroundings, in_scene: SceneCertificate, near: NearOdds) -> dict[str, Any]:
-    """Return the JSON of the scene that a policy was learnt in, with its odds (`schemas.policies.PolicyScene`)."""
-    return {"sha256": scene_digest(surroundings.scene), **surroundings.as_json()} | {
-        "certificate": as_json(in_scene),
-        "near": as_json(near),
-    }
-
-
-def joining_of(policy: Policy) -> dict[str, Any]:
-    """Return the format and the joining table of a policy; nothing by the rule nearest, which every client knows."""
-    domain = policy.domain
-    if domain.finishes_unjoined:
-        return {}
-    states = np.flatnonzero(domain.joins)
-    table = Joining(
-        join_share=domain.join_share,
-        states=tuple(states.tolist()),
-        phases=tuple(domain.joins[states].tolist()),
-    )
-    return {"format": JOINING_FORMAT, "joining": as_json(table)}
-
-
-def describe_grid(policy: Policy) -> dict[str, Any]:
-    """Return the JSON of a policy's grid world."""
-    grid = policy.path.grid
-    return {"origin_mm": list(grid.origin_mm), "cell_mm": grid.cell_mm, "shape": list(grid.shape)}

@@ -14,10 +14,11 @@ from sqlalchemy.orm import Session
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording
 from skills.db.session import Database
 from skills.errors import NotFound
+from skills.library.operation.integrity import planned
 from skills.library.people.recorded import recording_for, shown_recording
-from skills.library.plans.plans import find_plan, motion_of, trajectory_of
+from skills.library.plans.plans import find_plan, trajectory_of
 from skills.library.policies import versions
-from skills.library.policies.versions import poses_of
+from skills.library.policies.pose_styles import poses_of
 from skills.library.recordings.demos import demo_for, find_demo
 from skills.library.recordings.recordings import Parser, find_recording, stored_recording
 from skills.verification.timeline import (
@@ -56,12 +57,12 @@ def timeline_of(database: Database, source: Source, sha256: str, parse: Parser) 
         return timeline_of_path(poses.path, arm=poses.arm, frame=poses.frame)
     with database.reading() as session:
         plan = find_plan(session, sha256)
-        motion = motion_of(session, sha256)
+        motion = planned(plan)
         newest = select(StoredPlayback).where(StoredPlayback.plan_row == plan.row)
         played = session.scalar(newest.order_by(StoredPlayback.row.desc()).limit(1))
         measured = None if played is None else played.measured
-        passes = [] if played is None else played.report["doubt"]["under"][0]["passes"]
-    odds = {number: one["succeeds"]["probability"] for number, one in enumerate(passes)}
+        passes = () if played is None else played.report.doubt.under[0].passes
+    odds = {number: one.succeeds.probability for number, one in enumerate(passes)}
     return timeline_of_plan(trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds)
 
 

@@ -1,0 +1,88 @@
+"""The film and plots of a playback, drawn by a worker after the verdict is stored."""
+
+from collections.abc import Callable
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from skills.db.models import StoredPictures, StoredPlayback
+from skills.db.service_tables import Job, record_event
+from skills.db.session import Database
+from skills.errors import NotDrawnYet
+from skills.fields import as_json
+from skills.library.operation import jobs
+from skills.library.operation.jobs import PICTURES, PicturesRequest
+from skills.remedies import Action, Remedy
+from skills.settings import Settings
+from skills.verification.playback import Pictures
+
+
+def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> tuple[Job, bool]:
+    """Queue the pictures of a stored playback; return the job, and whether it is new."""
+    return jobs.ask(session, PICTURES, _wanted(playback), playback.plan.policy.surgeon, actor)
+
+
+def draw_pictures(
+    database: Database, request: PicturesRequest, settings: Settings
+) -> Callable[[Session, str], dict[str, Any]]:
+    """Draw the film and plots of a playback; the returned function stores them."""
+    from skills.simulation import film, pictures
+
+    with database.reading() as session:
+        playback = _playback(session, request)
+        measured, report = playback.measured, as_json(playback.report)
+    trajectory = measured.trajectory
+    shot = film.make_film(trajectory, pad_top_mm=float(measured.pad_mm[2]), memory_bytes=settings.playback_memory_bytes)
+    drawn = Pictures(
+        animation_mp4=shot.mp4,
+        animation_gif=shot.gif,
+        joints_png=pictures.png(pictures.draw_joints(trajectory, measured, report)),
+        clearance_png=pictures.png(pictures.draw_clearance(trajectory, measured, report)),
+    )
+
+    def store(session: Session, actor: str) -> dict[str, Any]:
+        playback = _playback(session, request)
+        of_playback = select(StoredPictures.row).where(StoredPictures.playback_row == playback.row)
+        # A retry of the job must not store the pictures twice.
+        if session.scalar(of_playback) is None:
+            session.add(StoredPictures(playback_row=playback.row, drawn=drawn))
+            record_event(session, actor, "draw", PICTURES, playback.sha256, playback.plan.policy.surgeon)
+        return {"playback": playback.sha256}
+
+    return store
+
+
+def find_pictures(session: Session, playback: StoredPlayback) -> Pictures:
+    """Return the pictures of a playback.
+
+    Raises:
+        NotDrawnYet: They are not drawn; the message names the job that draws them, or that failed to.
+    """
+    stored = session.scalar(select(StoredPictures).where(StoredPictures.playback_row == playback.row))
+    if stored is None:
+        raise _not_drawn(playback, job_of_pictures(session, playback))
+    return stored.drawn
+
+
+def job_of_pictures(session: Session, playback: StoredPlayback) -> Job | None:
+    """Return the newest job that draws the pictures of a playback, or failed to."""
+    return jobs.newest(session, PICTURES, _wanted(playback))
+
+
+def _not_drawn(playback: StoredPlayback, job: Job | None) -> NotDrawnYet:
+    draw = Remedy(Action.DRAW, playback=playback.sha256, plan=playback.plan.sha256)
+    if job is None:
+        return NotDrawnYet("No pictures of this playback were requested.", draw)
+    see = Remedy(Action.SEE_JOB, job=job.id)
+    if job.state in jobs.ACTIVE:
+        return NotDrawnYet("The pictures of this playback are being drawn.", see, job=job.id)
+    return NotDrawnYet("The pictures of this playback were not drawn.", see, draw, job=job.id)
+
+
+def _wanted(playback: StoredPlayback) -> PicturesRequest:
+    return {"plan": playback.plan.sha256, "playback": playback.sha256}
+
+
+def _playback(session: Session, request: PicturesRequest) -> StoredPlayback:
+    return session.scalars(select(StoredPlayback).where(StoredPlayback.sha256 == request["playback"])).one()

@@ -1,0 +1,103 @@
+"""Two policies of a style compared on the same demonstrations.
+
+A policy measured against its own demonstration alone is always near. So two policies are compared on all active
+demonstrations from which either was learnt: dynamic time warping of each policy's path from its demonstrated start with
+every demonstration's path in its grid, in mm, and the sum over the demonstrations.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from functools import partial
+from math import nan
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from skills.arrays import Floats
+from skills.db.models import Demonstration, PolicyVersion
+from skills.gridworld.grid import GridPath
+from skills.learning.evaluation import dtw
+from skills.learning.policy import Policy
+from skills.library.operation.integrity import learnt
+from skills.schemas.policies import PolicyManifest
+from skills.schemas.training import FitOnTheSame
+
+ROUNDING_MM = 1e-6  # two sums of the same distances in different order differ by less
+
+Space = tuple[str, str]  # arm and frame; paths in different ones cannot be compared
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePath:
+    """The path of a demonstration that a policy may have been learnt from."""
+
+    sha256: str
+    space: Space
+    path: GridPath
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyPath:
+    """The path of a policy from its demonstrated start, shape (T, 3) in mm."""
+
+    tip_mm: Floats
+    space: Space
+
+
+def not_worse(fit: FitOnTheSame) -> bool:
+    """Return whether the trained policy is at least as near as the released one; false if they cannot be compared."""
+    if fit.trained_mm is None or fit.released_mm is None:
+        return False
+    return fit.trained_mm <= fit.released_mm + ROUNDING_MM  # NaN is worse
+
+
+def format_mm(total_mm: float | None) -> str:
+    """Return a DTW total as text."""
+    return f"{nan if total_mm is None else total_mm:g}"
+
+
+def compare_paths(released: PolicyPath, trained: PolicyPath, references: Sequence[ReferencePath]) -> FitOnTheSame:
+    """Measure two policies against the same demonstrations.
+
+    Args:
+        released: The path of the released policy.
+        trained: The path of the new policy.
+        references: The demonstrations; the totals are None if there are none, or arms or frames differ.
+    """
+    comparable = references and len({released.space, trained.space, *(one.space for one in references)}) == 1
+
+    def total_mm(path: PolicyPath) -> float | None:
+        if not comparable:
+            return None
+        return float(sum(dtw(path.tip_mm, one.path.tip_mm).total_mm for one in references))
+
+    return FitOnTheSame(tuple(one.sha256 for one in references), total_mm(released), total_mm(trained))
+
+
+def policy_path(manifest: PolicyManifest, policy: Callable[[], Policy]) -> PolicyPath:
+    """Return the path of a policy from its demonstrated start.
+
+    Args:
+        manifest: The policy's manifest.
+        policy: Loads the policy; called only if it does not reproduce its demonstration, because otherwise the manifest
+            has the path.
+    """
+    if not manifest.grid_certificate.demonstration_reproduced:
+        return PolicyPath(policy().replay.tip_mm, manifest.space)
+    return PolicyPath(manifest.grid.centres_mm(np.array(manifest.waypoints)), manifest.space)
+
+
+def reference_paths(session: Session, demonstrations: Collection[int]) -> dict[int, ReferencePath]:
+    """Return the paths of the active ones of some demonstrations, by row, the oldest first."""
+    of = Demonstration
+    query = select(of.row, of.sha256, of.arm, of.frame, of.path).where(of.row.in_(demonstrations))
+    found = session.execute(query.where(of.withdrawn_at.is_(None)).order_by(of.row))
+    return {row: ReferencePath(sha256, (arm, frame), path) for row, sha256, arm, frame, path in found}
+
+
+def compare_versions(session: Session, released: PolicyVersion, trained: PolicyVersion) -> FitOnTheSame:
+    """Measure two stored versions of a style against the active demonstrations from which either was learnt."""
+    rows = {one.row for version in (released, trained) for one in version.demonstrations}
+    before, after = (policy_path(one.manifest, partial(learnt, one)) for one in (released, trained))
+    return compare_paths(before, after, list(reference_paths(session, rows).values()))
