@@ -17,7 +17,7 @@ from skills.errors import BadInput, BadSignature, Conflict
 from skills.keywords import RetrainingKeywords, TrainingKeywords
 
 if TYPE_CHECKING:
-    from skills.client import Client
+    from skills.client.blocking.client import Client
     from skills.schemas.policies import Coverage
     from skills.schemas.training import RetrainedStyle, Retraining
 
@@ -67,7 +67,7 @@ def train(
 
     With --release, the exit code is 1 if the style does not serve the version afterwards.
     """
-    from skills.schemas.results import TrainingResult
+    from skills.schemas.training import TrainingResult
 
     if (chosen := _learner(learner, setting or [], join)) is not None:
         options["learner"] = chosen

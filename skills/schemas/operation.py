@@ -1,7 +1,7 @@
 """Jobs: requests for work, their state and their result."""
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import Field
 
@@ -38,3 +38,13 @@ class Job(Given):
     created_at: datetime
     started_at: datetime | None
     ended_at: datetime | None
+
+
+class JobResult(Given):
+    """The base class of results."""
+
+    @classmethod
+    def of(cls, job: Job) -> Self:
+        """Return the result of a job of this kind that succeeded."""
+        assert job.result is not None, job
+        return cls.model_validate(job.result)

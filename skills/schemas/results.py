@@ -7,29 +7,8 @@ from typing import Any, Self
 
 from skills.fields import Sha256
 from skills.schemas import Given
-from skills.schemas.operation import Job
+from skills.schemas.operation import Job, JobResult
 from skills.schemas.tries import TryStep
-
-
-class JobResult(Given):
-    """The base class of results."""
-
-    @classmethod
-    def of(cls, job: Job) -> Self:
-        """Return the result of a job of this kind that succeeded."""
-        assert job.result is not None, job
-        return cls.model_validate(job.result)
-
-
-class TrainingResult(JobResult):
-    """The version that a training made, whether it is released, and if not as requested, why and what to do."""
-
-    policy_version: int
-    sha256: Sha256
-    releasable: bool
-    released: bool
-    not_released_because: str | None = None
-    remedy: str | None = None
 
 
 class PlaybackResult(JobResult):

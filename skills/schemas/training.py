@@ -13,7 +13,7 @@ from skills.fields import Count, Fraction, Sha256, Slug, schema
 from skills.gridworld.hazards import SceneCosts, Surroundings
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
 from skills.schemas import Given, Page, VersionNumber
-from skills.schemas.operation import Job, ServedNow
+from skills.schemas.operation import Job, JobResult, ServedNow
 from skills.schemas.requests import DigestField, PointIn, Schema, SlugField, shown
 from skills.schemas.scenes import SceneCostsIn, SceneIn, settings_schema
 
@@ -199,7 +199,7 @@ class StyleComparison(StoredComparison):
     was_released: bool
 
 
-class TrainingResult(Given):
+class TrainingResult(JobResult):
     """The result of a training's job, as it is stored: its version, and the effect on what the style serves."""
 
     policy_version: VersionNumber

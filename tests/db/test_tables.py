@@ -30,6 +30,8 @@ from tests.db.test_packed import PLAYBACK
 from tests.library import cases
 from tests.library.styles import retrain
 from tests.library.test_scores import calibration
+from tests.library.verdicts import verdict_on
+from tests.planning.motions import ideal_playback, small_trajectory
 
 FROZEN = (
     "recordings",
@@ -84,7 +86,9 @@ def fill(database: Database) -> None:
     plan = cases.add_plan(database)
     retrain(database)
     with database.writing() as session:
-        played = StoredPlayback(sha256="0" * 64, plan_row=plan.row, feasible=True, report={}, measured=PLAYBACK)
+        motion = small_trajectory(1)
+        verdict = verdict_on(plan.sha256, motion, ideal_playback(motion))
+        played = StoredPlayback(sha256="0" * 64, plan_row=plan.row, feasible=True, report=verdict, measured=PLAYBACK)
         session.add(played)
         session.flush()
         session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))

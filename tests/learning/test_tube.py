@@ -12,7 +12,7 @@ from skills.arrays import xyz
 from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, BadSettings
 from skills.gridworld.scene import Box, Capsule, Scene, Tissue
-from skills.learning import tube
+from skills.learning import pose_step
 from skills.learning.pose_step import Hands, advance, next_pose
 from skills.learning.pose_style import PHASES, PosePath
 from skills.learning.tube import CertifiedPoses, Update, certify_tube, clear_tube
@@ -207,7 +207,7 @@ def test_the_compiled_tick_equals_that_of_scipy(ahead: int) -> None:
 
 
 def test_the_compiled_and_the_plain_ticks_agree_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    agreed = run_both(monkeypatch, tube, "step_along", "nearest_pose")
+    agreed = run_both(monkeypatch, pose_step, "step_along", "nearest_pose")
     certify_tube(a_path(), LIMITS)
     next_pose(a_path(), (10.0, 3.0, -118.0), (0.0, 0.0, 0.0, 1.0), None, LIMITS)
     assert set(agreed) == {"step_along", "nearest_pose"}

@@ -34,20 +34,20 @@ def test_a_replay_that_was_off_by_a_millimetre_is_said_to_be(database: Database,
     demo = recorded(database, plan, off_mm=(0.0, 0.0, 1.0))
     with database.reading() as session:
         found = compare_with_plan(session, plan.sha256, demo.sha256)
-    assert found["start_mm"] == pytest.approx(1.0, abs=1e-9)
-    assert found["end_mm"] == pytest.approx(1.0, abs=0.1)  # mm; the last sample was not recorded
-    assert 0.4 <= found["mean_mm"] <= 1.0  # the offset is along z, where the alignment can shift the paths
-    assert found["max_mm"] <= 1.2
-    assert found["recorded_s"] > found["planned_s"] > 1
+    assert found.start_mm == pytest.approx(1.0, abs=1e-9)
+    assert found.end_mm == pytest.approx(1.0, abs=0.1)  # mm; the last sample was not recorded
+    assert 0.4 <= found.mean_mm <= 1.0  # the offset is along z, where the alignment can shift the paths
+    assert found.max_mm <= 1.2
+    assert found.recorded_s > found.planned_s > 1
 
 
 def test_a_replay_that_went_as_planned_is_nowhere_off(database: Database, plan: Plan):
     demo = recorded(database, plan, off_mm=(0.0, 0.0, 0.0))
     with database.reading() as session:
         found = compare_with_plan(session, plan.sha256, demo.sha256)
-    assert found["mean_mm"] < 0.1
-    assert np.max(found["rmse_mm"]) < 0.2
-    assert found["max_mm"] < 0.5
+    assert found.mean_mm < 0.1
+    assert np.max(found.rmse_mm) < 0.2
+    assert found.max_mm < 0.5
 
 
 def test_a_recording_of_another_arm_or_of_nothing_is_refused(database: Database, plan: Plan):

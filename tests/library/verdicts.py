@@ -8,8 +8,19 @@ from skills.planning.trajectory import Trajectory
 from skills.schemas import PolicyName
 from skills.schemas.playbacks import Verdict, finite
 from skills.verification.arm_errors import UNCALIBRATED, ArmErrors
+from skills.verification.gates import Limits
 from skills.verification.playback import Playback
-from skills.verification.probabilities import Cost, EstimateUnder, Faults, PassEstimate, Probability, SuccessEstimate
+from skills.verification.probabilities import (
+    JUDGE_VERSION,
+    UPWARDS,
+    Cost,
+    EstimateSettings,
+    EstimateUnder,
+    Faults,
+    PassEstimate,
+    Probability,
+    SuccessEstimate,
+)
 from skills.verification.verdict import judge
 
 WITHOUT_HAND_OFF = Faults(pad=0)
@@ -30,7 +41,8 @@ def doubted(
     """Return a report on a plan under some errors of the arms."""
     under = (EstimateUnder(whole, passes, errors),)
     costs = () if cost is None else (cost,)
-    return SuccessEstimate(0, None, False, 0, (), under, costs=costs, **more)
+    rest = {"settings": EstimateSettings(), "limits": Limits(), "version": JUDGE_VERSION, "pad_normal": UPWARDS} | more
+    return SuccessEstimate(0, None, False, 0, (), under, costs=costs, **rest)
 
 
 def doubt_of(*lower: float, errors: ArmErrors = UNCALIBRATED, **more: Any) -> SuccessEstimate:

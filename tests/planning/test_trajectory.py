@@ -245,7 +245,7 @@ def test_no_joint_of_either_arm_leaps_anywhere_and_none_exceeds_its_limits(shift
 
 
 def test_a_pass_goes_on_from_the_very_pose_in_which_the_last_one_ended():
-    motion = time_parametrise([taking_pose(-8.0 * k) for k in range(3)], rate_hz=100.0)
+    motion = time_parametrise([hand_off(-8.0 * k) for k in range(3)], rate_hz=100.0)
     for last in motion.last_samples[:-1]:
         np.testing.assert_array_equal(motion.tip_mm[last], motion.tip_mm[last + 1])
         np.testing.assert_allclose(motion.joints[last], motion.joints[last + 1], atol=1e-12)
@@ -257,16 +257,16 @@ def test_a_pass_goes_on_from_the_very_pose_in_which_the_last_one_ended():
 
 
 def test_a_transfer_is_straight_turns_the_jaw_back_and_rests_at_both_ends():
-    motion = time_parametrise([taking_pose(), taking_pose(-8.0)], rate_hz=200.0)
+    motion = time_parametrise([hand_off(), hand_off(-8.0)], rate_hz=200.0)
     at = np.flatnonzero((motion.pass_index == 1) & (motion.phase == TRANSFER))
-    start, end = GOAL_MM, taking_pose(-8.0).tip_mm[0]
+    start, end = GOAL_MM, hand_off(-8.0).tip_mm[0]
     along = (motion.tip_mm[at] - start) @ (end - start) / np.linalg.norm(end - start)
     away = motion.tip_mm[at] - start - along[:, None] * (end - start) / np.linalg.norm(end - start)
     assert np.linalg.norm(away, axis=1).max() < 1e-9
     assert (np.diff(along) >= 0).all()
     np.testing.assert_array_equal(motion.tip_mm[at[-1] + 1], end)
     rotation = matrix_of(motion.rotation_xyzw)
-    np.testing.assert_allclose(rotation[at[0]], taking_pose().target_rotation, atol=1e-12)
+    np.testing.assert_allclose(rotation[at[0]], hand_off().target_rotation, atol=1e-12)
     np.testing.assert_allclose(rotation[at[-1] + 1], POINTING_DOWN, atol=1e-12)
     steps = np.diff(along)
     assert max(steps[0], steps[-1]) < steps.max() / 1000
@@ -338,7 +338,7 @@ def test_a_jaw_that_winds_on_for_ever_is_refused_by_pass_phase_and_joint():
 def test_a_transfer_out_of_reach_is_named_with_its_pass_and_phase():
     far = PassPath(HAND_OFF_MM, POINTING_DOWN, None, [0.0, 50.0, -400.0])
     with pytest.raises(Unreachable, match="Pass 1, transfer") as caught:
-        time_parametrise([taking_pose(), far], rate_hz=60.0)
+        time_parametrise([hand_off(), far], rate_hz=60.0)
     numbers = caught.value.numbers
     assert (numbers["pass"], numbers["phase"], numbers["joint"]) == (1, TRANSFER, "insertion")
     with pytest.raises(BadPlan, match="metres"):
@@ -346,7 +346,7 @@ def test_a_transfer_out_of_reach_is_named_with_its_pass_and_phase():
 
 
 def test_turning_back_takes_the_shorter_way():
-    motion = time_parametrise([taking_pose(), taking_pose()], rate_hz=100.0)
+    motion = time_parametrise([hand_off(), hand_off()], rate_hz=100.0)
     at = (motion.pass_index == 1) & (motion.phase == TRANSFER)
     rotation = matrix_of(motion.rotation_xyzw[at])
     turned = np.degrees(angle_between(rotation[1:], rotation[:-1])).sum()

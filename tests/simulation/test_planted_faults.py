@@ -16,7 +16,7 @@ from skills.db.session import Database
 from skills.errors import BadPlan, SimulationFailed, Unreachable
 from skills.kinematics import POINTING_DOWN, forward, inverse, matrix_of, quaternion_of
 from skills.library.people.surgeons import find_surgeon
-from skills.library.plans.playbacks import find_playback, request_playback, standing_of
+from skills.library.plans.playbacks import find_playback, request_playback
 from skills.library.policies import releases
 from skills.library.recordings.demos import upload_demo
 from skills.planning import handoff
@@ -233,11 +233,11 @@ def test_a_policy_withdrawn_after_planning_is_told_with_the_playback(databases):
     plan = cases.add_plan(database)
     with database.reading() as session:
         before = played(database, plan)
-        assert standing_of(session, find_playback(session, before.sha256))["released"] is True
+        assert releases.serves(session, find_playback(session, before.sha256).plan.policy)
     with database.writing() as session:
         releases.withdraw(session, find_surgeon(session, "kestrel"), cases.SUTURE, "test")
     with database.reading() as session:
-        assert standing_of(session, find_playback(session, before.sha256))["released"] is False
+        assert not releases.serves(session, find_playback(session, before.sha256).plan.policy)
     assert played(database, plan).sha256 == before.sha256  # playing it again is harmless, and the verdict is the same
 
 

@@ -14,22 +14,25 @@ import skills
 from skills.arithmetic import wilson
 from skills.errors import BadInput, BadSettings
 from skills.kinematics import JAW_TIP_MM, POINTING_DOWN, matrix_of
-from skills.planning.handoff import HOLDING_RAD, JAW_CLOSED_RAD, JAW_OPEN_RAD, NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
-from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
+from skills.planning.handoff import (
+    HOLDING_RAD,
+    JAW_CLOSED_RAD,
+    JAW_OPEN_RAD,
+    NEEDLE_FREE_RAD,
+    NEEDLE_RADIUS_MM,
+    OtherArm,
+    PsmM,
+    realign,
+)
+from skills.planning.passes import PassPath
+from skills.planning.trajectory import Trajectory, time_parametrise
 from skills.verification import monte_carlo, probabilities
 from skills.verification.arm_errors import CALIBRATED, MEAN_LENGTH, SIZES, UNCALIBRATED, ArmErrors
-from skills.verification.clearance import (
-    FINGER_RADIUS_MM,
-    NEEDLE_FREE_RAD,
-    NEEDLE_THICK_MM,
-    WRIST_RADIUS_MM,
-    clearance_to_pad,
-    links_of,
-)
+from skills.verification.clearance import FINGER_RADIUS_MM, NEEDLE_THICK_MM, WRIST_RADIUS_MM, clearance_to_pad, links_of
 from skills.verification.error_draws import Displaced, draw
 from skills.verification.gates import Limits
 from skills.verification.monte_carlo import estimate_success, looked_at, scene_of
-from skills.verification.probabilities import EstimateSettings, EstimateUnder, SuccessEstimate
+from skills.verification.probabilities import JUDGE_VERSION, EstimateSettings, EstimateUnder, SuccessEstimate
 from tests.arms import EXACT
 from tests.by_day import some
 from tests.verification import worlds
@@ -115,7 +118,7 @@ def test_without_any_doubt_a_clear_plan_succeeds_for_certain(trajectory):
     assert (exact.plan.count, exact.plan.of, exact.plan.probability) == (40, 40, 1.0)
     assert exact.plan.lower == pytest.approx(1 / (1 + 1.959964**2 / 40))  # Wilson's bound of all of n, by hand
     assert all(one.caught.probability == 1.0 for one in exact.passes)
-    assert (found.with_psm_m, found.hand_offs, found.version) == (trajectory is BESIDE, 2, 3)
+    assert (found.with_psm_m, found.hand_offs, found.version) == (trajectory is BESIDE, 2, JUDGE_VERSION)
     assert exact.passes[0].faults.arms == (0 if trajectory is BESIDE else None)
 
 

@@ -79,7 +79,7 @@ class Connection:
         accept: str = "*/*",
         idempotent: bool = True,
     ) -> httpx.Response:
-        content = None if body is None else to_jsonable_python(given(body))
+        content = None if body is None else to_jsonable_python(given(body), fallback=_plain)
         target, query = fill(path, named)
         with showing_given({**named, **(content or {})}):
             return self._send(
@@ -241,6 +241,11 @@ def as_json(answer: httpx.Response) -> Any:
             f"{answer.request.url.host} answered, but not as suture-skills does; check the address and the "
             "proxies in between."
         ) from error
+
+
+def _plain(value: Any) -> Any:
+    """Return an array or a number of numpy as plain Python."""
+    return value.tolist()
 
 
 def _parse(kind: type[M], answer: Any) -> M:

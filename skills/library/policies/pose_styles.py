@@ -124,7 +124,7 @@ def find_next(
     rotation_xyzw: Sequence[float],
     phase: int | None,
 ) -> NextPose:
-    """Return the next pose of a version for a pose and its phase; see `skills.learning.tube.next_pose`."""
+    """Return the next pose of a version for a pose and its phase; see `skills.learning.pose_step.next_pose`."""
     step = next_pose(poses.path, position_mm, rotation_xyzw, phase, poses.tube.limits)
     return NextPose(
         version=version.version,

@@ -16,7 +16,7 @@ from skills.db.session import Database
 from skills.errors import NotFound
 from skills.library.operation.integrity import planned
 from skills.library.people.recorded import recording_for, shown_recording
-from skills.library.plans.plans import find_plan, trajectory_of
+from skills.library.plans.plans import find_plan, followed_plan, trajectory_of
 from skills.library.policies import versions
 from skills.library.policies.pose_styles import poses_of
 from skills.library.recordings.demos import demo_for, find_demo
@@ -56,7 +56,7 @@ def timeline_of(database: Database, source: Source, sha256: str, parse: Parser) 
             poses = poses_of(versions.followable(versions.find_by_digest(session, sha256)))
         return timeline_of_path(poses.path, arm=poses.arm, frame=poses.frame)
     with database.reading() as session:
-        plan = find_plan(session, sha256)
+        plan = followed_plan(session, sha256)
         motion = planned(plan)
         newest = select(StoredPlayback).where(StoredPlayback.plan_row == plan.row)
         played = session.scalar(newest.order_by(StoredPlayback.row.desc()).limit(1))
