@@ -3,8 +3,6 @@
 import ast
 import io
 import re
-import subprocess
-import sys
 import tokenize
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -255,14 +253,3 @@ def test_every_call_of_a_page_exists(page: Path) -> None:
 @pytest.mark.parametrize("path", ["/atlas/{suture}", "/demos/{id}/reading", "/policy"])
 def test_a_call_that_does_not_exist_is_found(path: str) -> None:
     assert not is_call(path)
-
-
-@pytest.mark.nightly  # 10 s of processor time
-@pytest.mark.needs("simulator")
-def test_the_walks_of_the_architecture_are_those_that_are_traced() -> None:
-    page = (ROOT / "ARCHITECTURE.md").read_text()
-    page = page[page.index("## Three walks") : page.index("## Around every")]
-    run = subprocess.run([sys.executable, "-m", "tests.walks"], cwd=ROOT, capture_output=True, text=True, check=True)
-    counts, stations = r"(\d+) stations in (\d+) files", re.findall(r"^ *\d+ (\w+) +(\S+)$", run.stdout, re.MULTILINE)
-    assert re.findall(r"`(\w+)`\s+\(([\w/.]+)\)", page) == stations
-    assert re.findall(counts, page) == re.findall(counts, run.stdout)

@@ -27,6 +27,7 @@ from skills.library.policies.batches import retrain_part
 from skills.library.policies.pose_styles import poses_of
 from skills.library.recordings.demos import withdraw_demo
 from skills.remedies import Remedy
+from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
@@ -271,7 +272,7 @@ def test_no_recording_is_read_without_consent(database: Database, monkeypatch: p
     add_both(database)
     job = cases.ask_training(database)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
     monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     ended = cases.work(database, job)
     assert ended.state == "failed" and "consent" in (ended.error or "")

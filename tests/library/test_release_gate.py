@@ -24,6 +24,7 @@ from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
 from skills.library.policies import gate, learning, releases, retraining, training
+from skills.schemas.people import Consent
 from skills.schemas.policies import GateRefusal
 from tests.formats.bags import sample_folder
 from tests.gridworld.paths import learnt
@@ -238,7 +239,7 @@ def test_a_pass_that_cannot_be_checked_is_refused(monkeypatch):
         ({}, [{}, {"withdrawn_at": 1}], "was withdrawn while"),
         ({"outcome": "failure"}, [{"outcome": "success"}], "was marked failure while"),
         ({}, [{"outcome": "recovery"}], "was marked recovery while"),
-        ({"consent": {"uses": []}}, [{}], "does not cover training"),
+        ({"consent": Consent(uses=[])}, [{}], "does not cover training"),
         ({"outcome": "success"}, [{}, {}], None),
     ],
 )

@@ -218,7 +218,7 @@ def test_retraining_releases_only_on_request_and_stores_the_comparison(database:
     (style,) = styles_of(database, retrain(database, release=True, learner=ValueIteration()))
     compared = style.comparison
     assert (compared.released.version, compared.trained.version) == (1, 2)
-    assert (compared.same_demonstration, compared.worse_because) == (True, [])
+    assert (compared.same_demonstration, list(compared.worse_because)) == (True, [])
     assert (compared.now_released, counted(database, Release)) == (True, 2)
     cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)))
     (style,) = styles_of(database, retrain(database, release=True))
