@@ -30,7 +30,7 @@ from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library.operation.integrity import learnt, planned, posed, scene_digest
 from skills.library.plans.plans import trajectory_of
 from skills.library.plans.playbacks import request_playback
-from skills.packing import canonical, sha256
+from skills.packing import sha256
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
 from tests.demonstration import arms
@@ -189,7 +189,7 @@ def of_plans(database: Database, plans: dict[str, Plan]) -> Iterator[tuple[str, 
         for name, plan in plans.items():
             row = session.get_one(Plan, plan.row)
             yield f"plan {name}", row.sha256
-            yield f"description of plan {name}", sha256(canonical(row.about))
+            yield f"description of plan {name}", sha256(row.about.model_dump_json().encode())
             yield f"trajectory of plan {name}", bits(trajectory_of(planned(row)))
 
 

@@ -251,7 +251,7 @@ def test_a_plan_in_another_frame_than_the_arms_base_is_refused(databases):
     )
     version = cases.train(database)
     plan = cases.add_plan(database, version=version.version)
-    assert plan.about["frame"] == "ECM"
+    assert plan.about.frame == "ECM"
     with database.writing() as session, pytest.raises(BadPlan, match="not the frame of the arm's base"):
         request_playback(session, plan.sha256, "test", Settings())
 
