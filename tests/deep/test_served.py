@@ -25,7 +25,9 @@ from skills.learning.q_learning import Training
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.integrity import learnt
 from skills.library.policies import releases
+from skills.library.policies.gate import GATE_VERSION
 from skills.library.policies.learning import certified, lessons, store_style
+from skills.library.policies.training import POSES_VERSION
 from skills.library.recordings.demos import find_demo
 from tests.api.conftest import service  # noqa: F401 - a fixture
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service
@@ -46,7 +48,8 @@ def store(service: Service, learner: Deep, network: Network | None = None) -> Po
     demo = service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
     request = {
         **KESTREL, "demos": [demo["sha256"]], "learner": describe_learner(learner),
-        "learner_version": LEARNER_VERSION, "seed": 0, "release": False, "near": asdict(NearLimits()),
+        "learner_version": LEARNER_VERSION, "gate": GATE_VERSION, "poses": POSES_VERSION, "seed": 0, "release": False,
+        "near": asdict(NearLimits()),
     }  # fmt: skip
     with service.database.reading() as session:
         (lesson,) = lessons(session, [find_demo(session, demo["sha256"]).row])
