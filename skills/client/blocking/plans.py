@@ -108,8 +108,8 @@ class Plans(Connection):
         Raises:
             Problem: Of status 409 while the plan may not be replayed, with the reason.
         """
-        which: dict[str, Any] = {"plan": plan, "handoff": handoff, "pass": pass_index}
-        return self._save(TRAJECTORY, to, progress, accept=BAG, **which)
+        which: Mapping[str, Any] = {"pass": pass_index}
+        return self._save(TRAJECTORY, to, progress, accept=BAG, plan=plan, handoff=handoff, **which)
 
     def compare(self, plan: str, demo: str, pass_index: int = 0) -> Comparison:
         """Compare a pass of a plan, counted from 0, with a demonstration cut from the recording of its replay."""
