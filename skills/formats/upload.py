@@ -27,16 +27,8 @@ from mcap.writer import Writer
 
 from skills.demonstration.recording import Label, Topic
 from skills.errors import BadInput, SkillsError, UnreadableRecording
-from skills.formats import rosbag
+from skills.formats import bag_folder, rosbag
 from skills.formats.archive import pack
-from skills.formats.bag_folder import (
-    METADATA,
-    check_counts,
-    in_order,
-    read_metadata,
-    suffix_of,
-    unzstd,
-)
 from skills.formats.checksums import digest_of
 from skills.formats.jigsaws import trials
 from skills.formats.lerobot import INFO
@@ -101,7 +93,7 @@ def find_bag(path: Path) -> Bag:
             *did_you_mean(path.name, beside),
             "Check its spelling and the current folder.",
         )
-    files = [file for file in sorted(path.rglob("*")) if file.is_file() and suffix_of(file.name)]
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and bag_folder.suffix_of(file.name)]
     homes = sorted({file.parent for file in files})
     if not homes and (path / INFO).is_file():
         raise BadInput(f"{path} is a LeRobot dataset.", Remedy(Action.CUT_EPISODE))
@@ -112,12 +104,12 @@ def find_bag(path: Path) -> Bag:
     if len(homes) != 1:
         listed = "".join(f"\n  {home}" for home in homes[:20])
         raise BadInput(f"{path} has {len(homes)} folders with bags; name one of them:{listed}.")
-    if len({suffix_of(file.name) for file in files}) > 1:
+    if len({bag_folder.suffix_of(file.name) for file in files}) > 1:
         raise BadInput(f"{homes[0]} has bags of several formats; name one of the files.")
-    metadata = homes[0] / METADATA
-    known = read_metadata(metadata.read_text(errors="replace")) if metadata.is_file() else None
+    metadata = homes[0] / bag_folder.METADATA
+    known = bag_folder.read_metadata(metadata.read_text(errors="replace")) if metadata.is_file() else None
     names = {file.name: file for file in files}
-    ordered = in_order(sorted(names, key=_by_number), known) if known else sorted(names, key=_by_number)
+    ordered = bag_folder.in_order(sorted(names, key=_by_number), known) if known else sorted(names, key=_by_number)
     return Bag(
         files=tuple(names[name] for name in ordered),
         metadata=metadata if known else None,
@@ -147,7 +139,7 @@ def prepare_upload(bag: Bag, progress: Progress = ignore) -> Iterator[Path]:
         stages = Path(folder) / "session_tags.json"
         stages.write_bytes(_stages(bag.labels))
         with path.open("rb") as file, stages.open("rb") as said, packed.open("wb") as out:
-            pack({f"{_NAME}/{_NAME}{suffix_of(path.name)}": file, "session_tags.json": said}, out)
+            pack({f"{_NAME}/{_NAME}{bag_folder.suffix_of(path.name)}": file, "session_tags.json": said}, out)
         yield packed
 
 
@@ -186,7 +178,7 @@ def _can_be_rewritten(file: Path) -> bool:
 
 def _check(bag: Bag, topics: Sequence[Topic]) -> None:
     if bag.metadata is not None:
-        check_counts(read_metadata(bag.metadata.read_text(errors="replace")), topics)
+        bag_folder.check_counts(bag_folder.read_metadata(bag.metadata.read_text(errors="replace")), topics)
 
 
 def _plain_file(file: Path, folder: Path) -> Path:
@@ -195,7 +187,7 @@ def _plain_file(file: Path, folder: Path) -> Path:
         return file
     plain = folder / file.stem
     with file.open("rb") as packed, plain.open("wb") as out:
-        unzstd(packed, out)
+        bag_folder.unzstd(packed, out)
     return plain
 
 
