@@ -250,9 +250,9 @@ def _recording(
         raise NoUsableTopic("The table has the pose of no arm: all its poses are 0.")
     for motion in motions:
         check_outside(motion)
-    setpoints = setpoints_in(values, motions, {}, stamps_ns)
-    here = {motion.topic for motion in (*motions, *setpoints.tips)} | {one.topic for one in joints}
-    here |= {signal.topic for _, signal in (*jaws, *setpoints.jaws)}
+    tips, jaw_setpoints, unusable = setpoints_in(values, motions, {}, stamps_ns)
+    here = {motion.topic for motion in (*motions, *tips)} | {one.topic for one in joints}
+    here |= {signal.topic for _, signal in (*jaws, *jaw_setpoints)}
     arms = sorted({motion.arm for motion in motions})
     return recording.Recording(
         format="csv",
@@ -262,10 +262,10 @@ def _recording(
         topics=tuple(recording.Topic(name, _KIND, len(stamps_ns)) for name in sorted(here)),
         joints=tuple(joints),
         tools=() if options.instrument is None else tuple((arm, options.instrument) for arm in arms),
-        left_out=(*left_out, *setpoints.left_out),
+        left_out=(*left_out, *unusable),
         columns=columns,
-        setpoints=tuple(setpoints.tips),
-        jaw_setpoints=tuple(setpoints.jaws),
+        setpoints=tuple(tips),
+        jaw_setpoints=tuple(jaw_setpoints),
     )
 
 

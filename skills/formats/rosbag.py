@@ -275,7 +275,7 @@ def _topics(reader: AnyReader) -> tuple[Topic, ...]:
     counts: Counter[tuple[str, str]] = Counter()
     for connection in reader.connections:
         counts[connection.topic, connection.msgtype] += connection.msgcount
-    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+    return topics.counted(counts)
 
 
 def _messages(reader: AnyReader, used: Sequence[Any]) -> Iterator[Message]:

@@ -42,11 +42,7 @@ from skills.demonstration.recording import (
     recorded_motion,
     recorded_signal,
 )
-from skills.errors import (
-    BadColumns,
-    BadSettings,
-    NoUsableTopic,
-)
+from skills.errors import BadColumns, BadSettings, NoUsableTopic
 from skills.formats import cells
 from skills.formats.columns import (
     BASE,

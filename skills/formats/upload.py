@@ -36,6 +36,7 @@ from skills.formats.mcap import MAGIC
 from skills.formats.mcap.reader import NOTES
 from skills.formats.mcap.records import RECOVER
 from skills.formats.tags import TAGS_BYTES, read_labels
+from skills.formats.topics import counted
 from skills.remedies import Action, Remedy, did_you_mean
 
 PICTURES = frozenset(
@@ -256,7 +257,7 @@ def topics_of(path: Path) -> tuple[Topic, ...]:
                     for one in summary.channels.values()
                 )
             file.seek(0)
-            return _topics(Counter((channel.topic, _type(schema)) for schema, channel, _ in _messages(file, ignore)))
+            return counted(Counter((channel.topic, _type(schema)) for schema, channel, _ in _messages(file, ignore)))
     except Exception as error:
         raise _unreadable(path, error) from error
 
@@ -302,7 +303,7 @@ def copy_without_pictures(
         except Exception as error:
             raise _unreadable(path, error) from error
     writer.finish()  # type: ignore[no-untyped-call]
-    return _topics(counts)
+    return counted(counts)
 
 
 def _place(writer: Writer, numbers: dict[tuple[object, ...], int], schema: Schema | None, channel: Channel) -> int:
@@ -333,10 +334,6 @@ def _messages(file: IO[bytes], progress: Progress) -> Iterator[tuple[Schema | No
     declared = None if summary is None or summary.statistics is None else summary.statistics.message_count
     if declared not in (None, found):
         raise UnreadableRecording(f"it declares {declared} messages, but has {found}")
-
-
-def _topics(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
-    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
 
 def _type(schema: Schema | None) -> str:

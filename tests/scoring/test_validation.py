@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from skills.errors import BadInput
+from skills.fields import parse_json
 from skills.scoring.calibration import held_out, rank_correlations
 from skills.scoring.validation import (
     ACCEPTED_P,
@@ -20,7 +21,6 @@ from skills.scoring.validation import (
     TaskValidation,
     known_parts,
     level_refusals,
-    parse_task,
     refusals,
     shuffled,
     validate,
@@ -38,7 +38,7 @@ def test_skill_that_shows_is_found_at_surgeons_left_out(judged: TaskValidation) 
     assert judged.model.rho > 0.8 and judged.model.rho_interval[0] > 0.6
     assert judged.repetition_out.rho > 0.8
     assert judged.over_duration[0] > 0 and judged.chance.rho_p == pytest.approx(1 / 40)
-    assert parse_task(json.loads(json.dumps(asdict(judged)))) == judged
+    assert parse_json(TaskValidation, json.loads(json.dumps(asdict(judged)))) == judged
     assert refusals(judged) == level_refusals(judged) == []
     assert len(known_parts(judged)) == 6
 

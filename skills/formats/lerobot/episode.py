@@ -106,7 +106,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
     }
     motions, left_out = _motions(values, joints, tools, stamps_ns, _frames(dataset, frame, {arm for arm, _ in values}))
     instruments = {arm: number for arm, tool in tools.items() if (number := _number(tool)) is not None}
-    setpoints = columns.setpoints_in(_values(table, commanded), motions, instruments, stamps_ns)
+    tips, jaw_setpoints, unusable = columns.setpoints_in(_values(table, commanded), motions, instruments, stamps_ns)
     return Recording(
         format="lerobot",
         integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
@@ -120,9 +120,9 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         joints=tuple(joints.values()),
         tools=tuple(sorted(tools.items())),
         notes=(*_notes(dataset, table), ("stamps", clock)),
-        left_out=(*left_out, *unknown, *setpoints.left_out),
-        setpoints=tuple(setpoints.tips),
-        jaw_setpoints=tuple(setpoints.jaws),
+        left_out=(*left_out, *unknown, *unusable),
+        setpoints=tuple(tips),
+        jaw_setpoints=tuple(jaw_setpoints),
     )
 
 

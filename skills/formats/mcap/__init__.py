@@ -198,54 +198,39 @@ def _ros2_name(name: str) -> str:
 
 
 def _recording(log: _Log) -> recording.Recording:
-    motions, masters, joints, tools, setpoints = [], [], [], [], []
-    signals: dict[TopicKind, dict[str, recording.Signal]] = {kind: {} for kind in TopicKind}
+    found: dict[TopicKind, list[tuple[str, Any]]] = {kind: [] for kind in TopicKind}  # owners and their values
     for topic in sorted(log.topics.values(), key=lambda topic: topic.name):
-        if not topic.columns:
-            continue
         kind, owner = topic.meaning.kind, topic.meaning.owner
         try:
-            if kind is TopicKind.MOTION:
-                motions.append(_motion(topic))
-            elif kind is TopicKind.MASTER:
-                masters.append(_motion(topic))
-            elif kind is TopicKind.SETPOINT:
-                setpoints.append(_motion(topic))
-            elif kind is TopicKind.JOINTS:
-                joints.append(_joints(topic))
-            elif kind is TopicKind.TOOL:
-                tools.append((owner, _tool(topic)))
-            else:
-                signals[kind][owner] = _signal(topic)
+            if topic.columns:
+                found[kind].append((owner, _MAKERS.get(kind, _signal)(topic)))
         except SkillsError as error:
             log.leave_out(topic, error)
-    pedals = signals[TopicKind.PEDAL]
-    return recording.Recording(
-        format="mcap",
-        integrity=log.walker.integrity,
-        motions=tuple(motions),
-        jaws=tuple(signals[TopicKind.JAW].items()),
-        clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
-        topics=_topics(log),
-        joints=tuple(joints),
-        masters=tuple(masters),
-        grippers=tuple(signals[TopicKind.GRIPPER].items()),
-        pedals=tuple(pedals.items()),
-        following=tuple(signals[TopicKind.FOLLOWING].items()),
-        scales=tuple(signals[TopicKind.SCALE].items()),
-        tools=tuple(tools),
-        notes=tuple(sorted(log.walker.notes.items())),
-        left_out=tuple(sorted(log.left_out.items())),
-        setpoints=tuple(setpoints),
-        jaw_setpoints=tuple(signals[TopicKind.JAW_SETPOINT].items()),
-    )
-
-
-def _topics(log: _Log) -> tuple[recording.Topic, ...]:
+    values = {kind: tuple(value for _, value in of_kind) for kind, of_kind in found.items()}
+    signals = {kind: tuple(dict(of_kind).items()) for kind, of_kind in found.items()}  # the last one of each owner
+    pedals = dict(signals[TopicKind.PEDAL])
     counts: Counter[tuple[str, str]] = Counter()
     for number, channel in log.walker.channels.items():
         counts[channel.topic, log.type_of(channel)] += log.walker.counts[number]
-    return tuple(recording.Topic(name, message_type, count) for (name, message_type), count in sorted(counts.items()))
+    return recording.Recording(
+        format="mcap",
+        integrity=log.walker.integrity,
+        motions=values[TopicKind.MOTION],
+        jaws=signals[TopicKind.JAW],
+        clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
+        topics=topics.counted(counts),
+        joints=values[TopicKind.JOINTS],
+        masters=values[TopicKind.MASTER],
+        grippers=signals[TopicKind.GRIPPER],
+        pedals=signals[TopicKind.PEDAL],
+        following=signals[TopicKind.FOLLOWING],
+        scales=signals[TopicKind.SCALE],
+        tools=tuple(found[TopicKind.TOOL]),
+        notes=tuple(sorted(log.walker.notes.items())),
+        left_out=tuple(sorted(log.left_out.items())),
+        setpoints=values[TopicKind.SETPOINT],
+        jaw_setpoints=signals[TopicKind.JAW_SETPOINT],
+    )
 
 
 # ---- from columns to values -------------------------------------------------------------------------------------
@@ -305,6 +290,13 @@ def _tool(topic: _Topic) -> str:
     if len(last) > TOOL_LIMIT or not last.isprintable():
         raise NoUsableTopic(f"{topic.name} names no instrument; remove the topic from the recording.", topic=topic.name)
     return last
+
+
+_MAKERS: dict[TopicKind, Callable[[_Topic], Any]] = {  # of all other kinds `_signal`
+    **dict.fromkeys((TopicKind.MOTION, TopicKind.MASTER, TopicKind.SETPOINT), _motion),
+    TopicKind.JOINTS: _joints,
+    TopicKind.TOOL: _tool,
+}
 
 
 def _in_order(topic: _Topic) -> tuple[Ints, Floats]:
