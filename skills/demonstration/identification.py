@@ -319,7 +319,7 @@ def _turn(poses: _Poses, rotation: Floats) -> float:
 
 def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) -> Identification:
     """Decide among the hypotheses, fitted to some samples, of which the first fits; `best` is fitted to all."""
-    near = [fit for fit in fits if not _is_told_apart(fit, fits[0])]
+    near = [fit for fit in fits if not _is_distinguishable(fit, fits[0])]
     others = [fit for fit in fits if fit not in near]
     if poses.in_base and (moved := _beside_the_base(poses, best)) is not None:
         return moved
@@ -338,7 +338,7 @@ def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) ->
     return replace(found, reason=f"joints and poses fit {names}")
 
 
-def _is_told_apart(other: _Fit, best: _Fit) -> bool:
+def _is_distinguishable(other: _Fit, best: _Fit) -> bool:
     """Return whether a hypothesis explains the poses so much worse than the best one that it is not the right one."""
     if not other.is_good:
         return True

@@ -185,7 +185,7 @@ CHANGES: dict[str, Callable[[], Files]] = {
     "the passes exchanged": lambda: bag_of(moved(np.roll(JOINTS, EACH, axis=0))),
     "another instrument": lambda: bag_of(moved(JOINTS, instrument="420006")),
     "the verdict swapped": lambda: edited("verdict.json", report=REPORT | {"trajectory": "6" * 64}),
-    "the verdict surer": lambda: edited("verdict.json", report=REPORT | {"doubt": {"under": []}}),
+    "the verdict surer": lambda: edited("verdict.json", report=REPORT | {"estimate": {"under": []}}),
     "the policy's limits removed": lambda: edited("policy.json", limits=""),
     "the plan's words changed": lambda: edited("plan.json", in_words="It is safe near a person."),
     "another plan with its own verdict": lambda: members() | papers(short()),

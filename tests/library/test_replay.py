@@ -59,7 +59,7 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
     if trajectory.psm_m is not None:
         tip_mm, apart_mm = psm_m_poses(trajectory, measured.looked_at)[0], np.full((len(trajectory), 24), 5.0)
         measured = replace(measured, psm_m_tip_mm=tip_mm, clearances_mm=apart_mm)
-    chosen = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of(trajectory)} | more
+    chosen = {"feasible": feasible, "failure_sentence": words, "trajectory": digest_of(trajectory)} | more
     report = verdict_on(plan.sha256, trajectory, measured, **chosen)
     identity = digest or report.identity
     with database.writing() as session:
@@ -96,7 +96,7 @@ def test_a_plan_is_cleared_by_its_own_newest_feasible_playback(database: Databas
     assert gate(database, plan) == first
     newer = judged(database, plan, samples=7)
     assert gate(database, plan) == newer
-    judged(database, plan, doubt=doubt_of(0.5))
+    judged(database, plan, estimate=doubt_of(0.5))
     with pytest.raises(Conflict, match=r"only 0.500, and 0.9 is required"):
         gate(database, plan)
     gate(database, plan, lower_bound=0.5)
@@ -212,37 +212,37 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
 @pytest.mark.parametrize(
     ("stored", "asked", "words"),
     [
-        ({"doubt": doubt_of(0.95)}, {}, None),
-        ({"doubt": doubt_of(0.9)}, {}, None),
-        ({"doubt": doubt_of(0.95, 0.91)}, {}, None),
-        ({"doubt": doubt_of(0.95, 0.89)}, {}, "only 0.890, and 0.9 is required"),
-        ({"doubt": doubt_of(0.0)}, {"lower_bound": 0.0}, None),
-        ({"doubt": doubt_of(math.nan)}, {}, "only nan"),
-        ({"doubt": doubt_of(0.95)}, {"lower_bound": math.nan}, "nan is required"),
+        ({"estimate": doubt_of(0.95)}, {}, None),
+        ({"estimate": doubt_of(0.9)}, {}, None),
+        ({"estimate": doubt_of(0.95, 0.91)}, {}, None),
+        ({"estimate": doubt_of(0.95, 0.89)}, {}, "only 0.890, and 0.9 is required"),
+        ({"estimate": doubt_of(0.0)}, {"lower_bound": 0.0}, None),
+        ({"estimate": doubt_of(math.nan)}, {}, "only nan"),
+        ({"estimate": doubt_of(0.95)}, {"lower_bound": math.nan}, "nan is required"),
         (
-            {"doubt": doubt_of(0.85)},
+            {"estimate": doubt_of(0.85)},
             {},
             "the errors of an uncalibrated arm a pass .* Most is lost by the offset of PSM_M's base: wi",
         ),
         (
-            {"doubt": doubt_of(0.95)},
+            {"estimate": doubt_of(0.95)},
             {"errors": CALIBRATED},
             "of an uncalibrated arm, which .* states the errors of a calibrated arm",
         ),
-        ({"doubt": doubt_of(0.95), "stated_by": "request"}, {"errors": CALIBRATED}, None),
+        ({"estimate": doubt_of(0.95), "stated_by": "request"}, {"errors": CALIBRATED}, None),
         (
-            {"doubt": doubt_of(0.85, errors=CALIBRATED), "stated_by": "request"},
+            {"estimate": doubt_of(0.85, errors=CALIBRATED), "stated_by": "request"},
             {},
             "With the errors of a calibrated arm a pass",
         ),
-        ({"doubt": doubt_of()}, {}, "only nan"),
+        ({"estimate": doubt_of()}, {}, "only nan"),
         (
-            {"doubt": doubt_of(0.99, version=JUDGE_VERSION - 1)},
+            {"estimate": doubt_of(0.99, version=JUDGE_VERSION - 1)},
             {},
             "judged by another version of the checks; play it again",
         ),
-        ({"doubt": doubt_of(0.99, version=JUDGE_VERSION + 1)}, {}, "judged by another version"),
-        ({"doubt": doubt_of(0.99), "check_version": CHECK_VERSION - 1}, {}, "judged by another version"),
+        ({"estimate": doubt_of(0.99, version=JUDGE_VERSION + 1)}, {}, "judged by another version"),
+        ({"estimate": doubt_of(0.99), "check_version": CHECK_VERSION - 1}, {}, "judged by another version"),
     ],
 )
 def test_the_least_certain_pass_has_to_reach_the_lower_bound(stored, asked, words):
