@@ -64,6 +64,12 @@ def _is_frozen(values: ArrayLike, dtype: Any) -> TypeGuard[NDArray[Any]]:
     return values.flags.owndata and values.flags.c_contiguous and values.flags.aligned and not values.flags.writeable
 
 
+def nearest(stamps_ns: Ints, wanted_ns: Ints) -> Ints:
+    """Return the indices of those of some ascending stamps that are nearest to other stamps, and earlier of two."""
+    known, origin = stamps_ns - stamps_ns[:1], stamps_ns[:1]  # smaller, so that their sums are integers too
+    return np.searchsorted(known[:-1] + known[1:], 2 * (wanted_ns - origin)).astype(np.int64)
+
+
 def xyz(values: Floats) -> Point:
     """Return three numbers, shape (3,), as Python's own."""
     x, y, z = values.tolist()

@@ -31,7 +31,7 @@ import numpy as np
 from skills.arrays import Floats, Ints
 from skills.demonstration import recording
 from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
-from skills.formats.cells import check_whole, header_of, open_text, read_numbers
+from skills.formats import cells
 from skills.formats.columns import (
     BASE,
     POSE_PARTS,
@@ -101,9 +101,9 @@ def read_ee_csv(file: BinaryIO, options: ReadingOptions) -> recording.Recording:
         raise BadSettings("The columns name their arms; omit table_arm.")
     if options.unit:
         raise BadSettings("The columns of an ee_csv are in m, rad and ns; omit unit, or map the columns of one arm.")
-    check_whole(file)
-    with open_text(file) as text:
-        names, _ = header_of(text)
+    cells.check_whole(file)
+    with cells.open_text(file) as text:
+        names, _ = cells.header_of(text)
     groups, faults = _groups(names)
     if names.count(TIME) > 1:
         raise _doubled(TIME)
@@ -126,11 +126,12 @@ def _read(
 ) -> tuple[Ints, dict[Quantity, Parts]]:
     """Return the stamps, shape (T,), and the numbers of each quantity."""
     file.seek(0)
-    with open_text(file) as text:
-        names, separator = header_of(text)
+    with cells.open_text(file) as text:
+        names, separator = cells.header_of(text)
         apart = {one: [columns] if one[1] in _PARTS else [columns[:3], columns[3:]] for one, columns in groups.items()}
         used = [*([[time]] if time is not None else []), *(list(part) for parts in apart.values() for part in parts)]
-        numbers = read_numbers(text, names, used, separator, options.decimal, None if time is None else (time, "ns"))
+        at = None if time is None else (time, "ns")
+        numbers = cells.read_numbers(text, cells.TableLayout(names, used, separator, options.decimal, at))
     found = iter(numbers.groups)
     if time is not None:
         _check_whole(next(found))

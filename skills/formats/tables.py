@@ -176,14 +176,9 @@ def read_table(file: BinaryIO, reading: ReadingOptions | None = None) -> Recordi
         _check_groups(uses)
         time = uses.get("t")
         check_time(None if time is None else names[time.index], options)
-        numbers = cells.read_numbers(
-            text,
-            names,
-            [[use.index] for use in uses.values()],
-            separator,
-            options.decimal,
-            None if time is None else (time.index, time.unit),
-        )
+        at = None if time is None else (time.index, time.unit)
+        used = [[use.index] for use in uses.values()]
+        numbers = cells.read_numbers(text, cells.TableLayout(names, used, separator, options.decimal, at))
     if not is_ended:
         cells.check_last_number(file, separator, options.decimal)
     stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, options)

@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, BinaryIO, TypeVar
 
 import numpy as np
@@ -138,11 +137,11 @@ class Papers:
     policy: PolicyPaper
 
 
-def verify_bag(path: Path, key: PublicKey | None = None) -> list[str]:
+def verify_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
     """Verify a replay bag, and return the checks that passed as text.
 
     Args:
-        path: The file.
+        file: The bag.
         key: The public key of the service that must have signed it. Without it a signature is not verified.
 
     Raises:
@@ -150,12 +149,6 @@ def verify_bag(path: Path, key: PublicKey | None = None) -> list[str]:
         BadSignature: Another key signed it, or it was changed since.
         UnreadableRecording: The archive or a file in it is damaged or dangerous.
     """
-    with path.open("rb") as file:
-        return check_bag(file, key)
-
-
-def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
-    """Verify a replay bag in an open file; see `verify_bag`."""
     archive = Archive(file)
     arms = _arms_in(archive.names)
     sums = _check_sums(archive)
@@ -163,7 +156,8 @@ def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
     papers = _read_papers(archive)
     plan, verdict = papers.plan, papers.verdict
     _check_statement(statement, papers)
-    motions = [_read_arm(archive, name, plan) for name in arms]
+    read = [_read_arm(archive, name, plan) for name in arms]
+    motions = [motion for motion, _ in read]
     _check_roles(motions, plan)
     _check_timetable(_paper(archive, EXECUTOR, replay_bag.ExecutorTimetable), plan, motions)
     for motion in motions:
@@ -172,7 +166,7 @@ def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
         f"{len(archive.names)} files, and {SUMS} has the right checksum of each other file.",
         f"Plan {plan.sha256[:12]}, the feasible verdict {verdict.sha256[:12]} and policy {papers.policy.sha256[:12]} "
         "belong together.",
-        *(_describe(motion) for motion in motions),
+        *(_describe(motion, off_mm) for motion, off_mm in read),
         *([] if plan.psm_m else ["It has no hand-off: no PSM_M, no A2."]),
         signed,
     ]
@@ -331,8 +325,8 @@ class _Topic:
         return np.concatenate([columns.values for columns in self.columns])
 
 
-def _read_arm(archive: Archive, name: str, plan: PlanPaper) -> replay_bag.ArmMotion:
-    """Read one arm's folder, and run all checks that concern this arm alone."""
+def _read_arm(archive: Archive, name: str, plan: PlanPaper) -> tuple[replay_bag.ArmMotion, float]:
+    """Read one arm's folder, and run all checks that concern this arm alone; see `_check_form` for the number."""
     file_name = f"{name}.mcap"
     with archive.unpacked(f"{name}/{file_name}") as file:
         walker, topics = _walk(file, name)
@@ -343,9 +337,9 @@ def _read_arm(archive: Archive, name: str, plan: PlanPaper) -> replay_bag.ArmMot
     if archive.text(f"{name}/{METADATA}").encode() != metadata_of(written, file_name):
         raise BadBag(f"{name}/{METADATA} does not describe {file_name}. Export the bag again.")
     _check_joints(motion, topics)
-    _check_form(motion)
+    off_mm = _check_form(motion)
     _check_written(motion, walker.notes, topics, plan)
-    return motion
+    return motion, off_mm
 
 
 def _walk(file: BinaryIO, name: str) -> tuple[Walker, dict[str, _Topic]]:
@@ -496,9 +490,13 @@ def _check_samples(what: str, motion: replay_bag.ArmMotion, good: Flags) -> None
         )
 
 
-def _check_form(motion: replay_bag.ArmMotion) -> None:
-    """Check that the tip's poses agree with the forward kinematics of the joints."""
-    off_mm, off_rad = _off_the_form(motion)
+def _check_form(motion: replay_bag.ArmMotion) -> float:
+    """Check that the tip's poses agree with the joints' forward kinematics; return their greatest distance in mm."""
+    off_mm = off_rad = np.nan  # as they remain if a quaternion is not of length one
+    if (np.abs(np.linalg.norm(motion.rotation_xyzw, axis=1) - 1.0) <= FORM_RAD).all():
+        tip_mm, rotation = forward(in_mm(motion.joints), motion.instrument)
+        off_mm = float(np.linalg.norm(1000.0 * motion.tip_m - tip_mm, axis=1).max())
+        off_rad = float(angle_between(matrix_of(motion.rotation_xyzw), rotation).max())
     if not (off_mm <= FORM_MM and off_rad <= FORM_RAD):
         raise BadBag(
             f"{motion.name}: {motion.topics[1]} is up to {off_mm:.3g} mm and {off_rad:.3g} rad from the pose at "
@@ -506,20 +504,7 @@ def _check_form(motion: replay_bag.ArmMotion) -> None:
             off_mm=off_mm,
             off_rad=off_rad,
         )
-
-
-def _off_the_form(motion: replay_bag.ArmMotion) -> tuple[float, float]:
-    """Return the largest deviations of tip and rotation from the closed form.
-
-    Returns:
-        In mm and rad; NaN if a quaternion is not of length one.
-    """
-    length = np.linalg.norm(motion.rotation_xyzw, axis=1)
-    if not (np.abs(length - 1.0) <= FORM_RAD).all():
-        return np.nan, np.nan
-    tip_mm, rotation = forward(in_mm(motion.joints), motion.instrument)
-    apart_mm = np.linalg.norm(1000.0 * motion.tip_m - tip_mm, axis=1)
-    return float(apart_mm.max()), float(angle_between(matrix_of(motion.rotation_xyzw), rotation).max())
+    return off_mm
 
 
 def _check_written(
@@ -587,9 +572,8 @@ def _check_judged(motion: replay_bag.ArmMotion, report: ReportPaper) -> None:
         )
 
 
-def _describe(motion: replay_bag.ArmMotion) -> str:
+def _describe(motion: replay_bag.ArmMotion, off_mm: float) -> str:
     """Return the summary of an arm's checks, with the bounding box of its motion."""
-    off_mm, _ = _off_the_form(motion)
     low, high = motion.extent_mm.tolist()
     box = ", ".join(f"{axis} [{a:.2f}, {b:.2f}]" for axis, a, b in zip("XYZ", low, high, strict=True))
     seconds = float(motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9

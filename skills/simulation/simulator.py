@@ -26,7 +26,6 @@ from importlib.metadata import version
 from importlib.resources import as_file, files
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -105,15 +104,16 @@ def opened(instrument: str, rate_hz: float) -> Iterator["Simulator"]:
     """Open a fresh scene with PSM_A, and close it at the end; a fresh one gives the same numbers each time."""
     require_pybullet()
     import pybullet
+    from pybullet_utils.bullet_client import BulletClient
 
-    client = pybullet.connect(pybullet.DIRECT)
+    bullet = BulletClient(pybullet.DIRECT)
     try:
-        pybullet.setTimeStep(1.0 / rate_hz, physicsClientId=client)
-        pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-        pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        yield Simulator(pybullet, client, instrument_of(instrument))
+        bullet.setTimeStep(1.0 / rate_hz)
+        bullet.setGravity(0, 0, -9.81)
+        bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
+        yield Simulator(bullet, instrument_of(instrument))
     finally:
-        pybullet.disconnect(physicsClientId=client)
+        bullet.disconnect()
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,8 @@ class SceneBody:
 class Simulator:
     """One simulation. Lengths in arguments are in mm, except in `drive` and in cameras, which use PyBullet's metres."""
 
-    def __init__(self, bullet: ModuleType, client: int, tool: InstrumentConstants) -> None:
-        self.bullet: Any = bullet
-        self.client = client
+    def __init__(self, bullet: Any, tool: InstrumentConstants) -> None:
+        self.bullet = bullet
         self.tool = tool
         self.files: dict[str, str] = {}
         self.arm = self._load_arm(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), tool, HOLDING_RAD)
@@ -169,21 +168,17 @@ class Simulator:
         """
         tool = instrument_of(instrument) if instrument else self.tool
         self.psm_m = self._load_arm(base_mm, base_xyzw, tool, OPEN_RAD)
-        links = range(-1, self.bullet.getNumJoints(self.psm_m.number, physicsClientId=self.client))
+        links = range(-1, self.bullet.getNumJoints(self.psm_m.number))
         for link in links:
             for own in links:
-                self.bullet.setCollisionFilterPair(
-                    self.arm.number, self.psm_m.number, own, link, 0, physicsClientId=self.client
-                )
-            self.bullet.changeVisualShape(self.psm_m.number, link, rgbaColor=PSM_M_COLOUR, physicsClientId=self.client)
+                self.bullet.setCollisionFilterPair(self.arm.number, self.psm_m.number, own, link, 0)
+            self.bullet.changeVisualShape(self.psm_m.number, link, rgbaColor=PSM_M_COLOUR)
 
     def pose(self, joints: Floats, body: SceneBody | None = None) -> None:
         """Set an arm's joints (rad, insertion mm) exactly, at rest."""
         arm = body or self.arm
         # One call for all joints takes a fifth of the time of one call for each.
-        self.bullet.resetJointStatesMultiDof(
-            arm.number, arm.joints, in_metres(joints)[:, None].tolist(), physicsClientId=self.client
-        )
+        self.bullet.resetJointStatesMultiDof(arm.number, arm.joints, in_metres(joints)[:, None].tolist())
 
     # -- measurements and motion --
 
@@ -195,7 +190,7 @@ class Simulator:
 
     def joint_states(self) -> Any:
         """Return PSM_A's joint states in PyBullet's form: position, speed, reaction, effort of each."""
-        return self.bullet.getJointStates(self.arm.number, self.arm.joints, physicsClientId=self.client)
+        return self.bullet.getJointStates(self.arm.number, self.arm.joints)
 
     def read_tip(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return PSM_A's tool frame: position in mm and quaternion."""
@@ -204,16 +199,16 @@ class Simulator:
 
     def frame_of(self, body: SceneBody, link: int) -> Any:
         """Return the frame of a link in PyBullet's form: position in m and quaternion."""
-        state = self.bullet.getLinkState(body.number, link, 0, 1, self.client)
+        state = self.bullet.getLinkState(body.number, link, 0, 1)
         return state[PLACE], state[TURN]
 
     def closest(self, body: int, other: int) -> Any:
         """Return the nearest points of all links of two bodies that are near each other, in PyBullet's form."""
-        return self.bullet.getClosestPoints(body, other, CLEARANCE_SEEN_MM * MM, physicsClientId=self.client)
+        return self.bullet.getClosestPoints(body, other, CLEARANCE_SEEN_MM * MM)
 
     def pressed_n(self) -> float:
         """Return the force of the pad on PSM_A, N."""
-        points = self.bullet.getContactPoints(self.arm.number, self.pad, physicsClientId=self.client)
+        points = self.bullet.getContactPoints(self.arm.number, self.pad)
         return float(sum(point[9] for point in points))
 
     def drive(self, start: list[float], velocity: list[float]) -> None:
@@ -232,9 +227,8 @@ class Simulator:
             forces=self._efforts,
             positionGains=self._position_gains,
             velocityGains=self._velocity_gains,
-            physicsClientId=self.client,
         )
-        self.bullet.stepSimulation(physicsClientId=self.client)
+        self.bullet.stepSimulation()
 
     def photograph(self, camera: pictures.Camera, needle: tuple[Floats, Floats] | None = None) -> pictures.Photograph:
         """Return an image of the present scene, the needle in a given pose (mm, quaternion) or between PSM_A's jaws."""
@@ -252,7 +246,6 @@ class Simulator:
             projection,
             lightDirection=(0.3, 0.5, 1.0),
             renderer=self.bullet.ER_TINY_RENDERER,
-            physicsClientId=self.client,
         )
         size = (camera.height, camera.width)
         return pictures.Photograph(
@@ -270,9 +263,7 @@ class Simulator:
     def _place_needle(self, place_mm: Floats, quaternion: Floats) -> None:
         if self.needle is None:
             self.needle = self._load("needle.urdf", np.zeros(3), [0.0, 0.0, 0.0, 1.0])
-        self.bullet.resetBasePositionAndOrientation(
-            self.needle, (place_mm * MM).tolist(), quaternion.tolist(), physicsClientId=self.client
-        )
+        self.bullet.resetBasePositionAndOrientation(self.needle, (place_mm * MM).tolist(), quaternion.tolist())
 
     # -- loading --
 
@@ -295,7 +286,6 @@ class Simulator:
                     globalScaling=scale,
                     # Without it PyBullet makes cylinders into hulls, a millimetre too thick.
                     flags=self.bullet.URDF_USE_IMPLICIT_CYLINDER,
-                    physicsClientId=self.client,
                 )
             )
 
@@ -303,10 +293,7 @@ class Simulator:
         self, position_mm: Floats, quaternion: Floats, tool: InstrumentConstants, opening_rad: float
     ) -> SceneBody:
         number = self._load("psm.urdf", position_mm, np.asarray(quaternion).tolist(), wrist_mm=tool.wrist_offset_mm)
-        found = [
-            self.bullet.getJointInfo(number, index, physicsClientId=self.client)
-            for index in range(self.bullet.getNumJoints(number, physicsClientId=self.client))
-        ]
+        found = [self.bullet.getJointInfo(number, index) for index in range(self.bullet.getNumJoints(number))]
         by_joint = {info[1].decode(): int(info[0]) for info in found}
         by_link = {info[12].decode(): int(info[0]) for info in found}
         arm = SceneBody(
@@ -317,7 +304,7 @@ class Simulator:
             shaft=by_link["roll_link"],
             surfaces=tuple(by_link[name] for name in LINKS),
         )
-        self.bullet.changeDynamics(number, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
+        self.bullet.changeDynamics(number, -1, linearDamping=0.0, angularDamping=0.0)
         lower, upper = in_metres(tool.lower).tolist(), in_metres(tool.upper).tolist()
         for joint, index in enumerate(arm.joints):
             # The file has the Classic's limits, a Si has others. A separate call, because with damping in the same call
@@ -327,10 +314,9 @@ class Simulator:
                 index,
                 jointLowerLimit=lower[joint],
                 jointUpperLimit=upper[joint],
-                physicsClientId=self.client,
             )
         for index in arm.fingers:
-            self.bullet.resetJointState(number, index, opening_rad, physicsClientId=self.client)
+            self.bullet.resetJointState(number, index, opening_rad)
         return arm
 
 
@@ -405,14 +391,14 @@ def kinematic_pass(scene: Simulator, asked: PlayRequest) -> KinematicPass:
     distances = _Distances(scene, motion)
     values, places, turns = array("d"), array("d"), array("d")
     due = set(asked.looks.tolist())
-    bullet, client, arm = scene.bullet, scene.client, scene.arm
+    bullet, arm = scene.bullet, scene.arm
     put, read_joints, read_link = bullet.resetJointStatesMultiDof, bullet.getJointStates, bullet.getLinkState
     number, joints, tool = arm.number, arm.joints, arm.tool
     for k, row in enumerate(_rows(in_metres(motion.joints)[:, :, None])):
-        put(number, joints, row, physicsClientId=client)
-        a, b, c, d, e, f = read_joints(number, joints, client)
+        put(number, joints, row)
+        a, b, c, d, e, f = read_joints(number, joints)
         values.extend((a[0], b[0], c[0], d[0], e[0], f[0]))
-        frame = read_link(number, tool, 0, 1, client)
+        frame = read_link(number, tool, 0, 1)
         places.extend(frame[PLACE])
         turns.extend(frame[TURN])
         if k in due:

@@ -19,7 +19,7 @@ import pytest
 
 from skills.errors import BadBag, BadSignature, SkillsError
 from skills.formats.replay_bag import arms_of, folder_of, seal
-from skills.formats.verify import SIGNATURE, check_bag
+from skills.formats.verify import SIGNATURE, verify_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import A1, A2, Trajectory
@@ -87,7 +87,7 @@ def signed(files: Files, key: SigningKey = KEY, head_key: SigningKey = KEY, **fa
 
 def checked(files: Files, key: PublicKey | None = PUBLIC) -> list[str]:
     """Seal files with right checksums and check them."""
-    return check_bag(io.BytesIO(seal(files)), key)
+    return verify_bag(io.BytesIO(seal(files)), key)
 
 
 @cache
@@ -322,7 +322,7 @@ def test_200_flipped_bits_of_the_archive_are_refused_or_change_no_file():
         flipped = bytearray(whole)
         flipped[place // 8] ^= 1 << place % 8
         try:
-            check_bag(io.BytesIO(bytes(flipped)), PUBLIC)
+            verify_bag(io.BytesIO(bytes(flipped)), PUBLIC)
         except SkillsError:
             continue
         with zipfile.ZipFile(io.BytesIO(bytes(flipped))) as archive:  # a date, or another field that means nothing here

@@ -19,7 +19,7 @@ from skills.db.packed import digest as digest_of
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt, NotFound
 from skills.formats.replay_bag import arms_of
-from skills.formats.verify import check_bag
+from skills.formats.verify import verify_bag
 from skills.library.operation.history import sign_history
 from skills.library.operation.integrity import planned
 from skills.library.people.surgeons import find_surgeon
@@ -263,7 +263,7 @@ def test_the_bag_is_complete_deterministic_and_holds_the_plans_samples(database:
         replay_bag(database, "0" * 64, OF_A1_ALONE)
     data = replay_bag(database, plan.sha256, OF_A1_ALONE)
     assert data == replay_bag(database, plan.sha256, OF_A1_ALONE)
-    lines = check_bag(io.BytesIO(data))
+    lines = verify_bag(io.BytesIO(data))
     assert playback[:12] in lines[1]
     with database.reading() as session:
         trajectory = trajectory_of(find_plan(session, plan.sha256).plan)
@@ -297,7 +297,7 @@ def test_the_bag_is_signed_under_the_first_checkpoint_with_its_verdict(database:
         note = newest_checkpoint(session.connection()) or ""  # the export has signed the history
     head = read_notes(note)[0].checkpoint
     key = PublicKey(head.origin, database.history.key.public)
-    line = check_bag(io.BytesIO(data), key)[-1]
+    line = verify_bag(io.BytesIO(data), key)[-1]
     assert f"the history of {head.size} leaves with the root {head.root.hex()[:12]}" in line
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert f"{head.size} leaves, root {head.root.hex()}" in archive.read("README.txt").decode()
@@ -346,7 +346,7 @@ def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
 
 def samples(database: Database, plan: Plan, pass_index: int | None = None) -> list[tuple[str, int]]:
     """Check a bag, and count each arm's samples."""
-    lines = check_bag(io.BytesIO(replay_bag(database, plan.sha256, OF_A1_ALONE, pass_index)))
+    lines = verify_bag(io.BytesIO(replay_bag(database, plan.sha256, OF_A1_ALONE, pass_index)))
     return [(line.split()[0], int(line.split()[3])) for line in lines[2:-1]]
 
 
