@@ -197,8 +197,8 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         optimal, best = optimal_in_scene(mdp_of(policy), policy.greedy, live)
         faint = np.zeros_like(live)
     finishing = finishes(policy)
-    share = shares_of(policy, finishing)
-    covered = Coverage(_reaches(policy, finishing), _joins_nearest(policy), share)
+    covered = coverage(policy, finishing)
+    share = covered.share
     certificate = Certificate(
         checked=int(live.sum()),
         suboptimal=int(np.count_nonzero(live & ~optimal)),
@@ -408,22 +408,18 @@ def _fewest_moves(policy: Policy) -> Ints:
     return np.asarray(distance_transform_cdt(away, "chessboard").ravel(), np.int64)
 
 
-def coverage(policy: Policy) -> Coverage:
+def coverage(policy: Policy, finishing: Flags | None = None) -> Coverage:
     """Follow a policy from every state at once.
 
     Args:
         policy: The policy.
+        finishing: What `finishes` returns for it, where it is known.
 
     Returns:
         The success from every start.
     """
-    finishing = finishes(policy)
-    return Coverage(_reaches(policy, finishing), _joins_nearest(policy), shares_of(policy, finishing))
-
-
-def _reaches(policy: Policy, finishing: Flags) -> Flags:
-    rows = policy.domain.start_rows
-    return np.asarray((rows < 0) | finishing[rows])
+    rows, done = policy.domain.start_rows, finishes(policy) if finishing is None else finishing
+    return Coverage((rows < 0) | done[rows], _joins_nearest(policy), shares_of(policy, done))
 
 
 def _joins_nearest(policy: Policy) -> Flags:
