@@ -369,7 +369,8 @@ def validate(
     sets = usable(signatures) if sets is None else sets
     fold = folds_of(sessions, truth, FOLDS)
     # A surgeon whose sessions were all left out together cannot be tested.
-    tested = np.array([one for one in range(len(truth)) if _elsewhere(truth, fold, one)], np.int64)
+    elsewhere = (truth[:, None] == truth) & (fold[:, None] != fold)
+    tested = np.flatnonzero(elsewhere.any(axis=1))
     if len(np.unique(truth[tested])) < 2:
         raise BadInput("Recognition needs at least two surgeons with two sessions each; record more.")
     settings, temperature = _choose(signatures, truth, sessions, len(labels), sets)
@@ -402,11 +403,6 @@ def _left_out(fold: Ints) -> Iterator[Flags]:
     """Yield the demonstrations of each group, as flags; of a single group, none, for nothing is left to learn from."""
     groups = np.unique(fold)
     yield from (fold == one for one in groups if len(groups) > 1)
-
-
-def _elsewhere(truth: Ints, fold: Ints, one: int) -> bool:
-    """Return whether the surgeon of a demonstration has another one in another group."""
-    return bool(((truth == truth[one]) & (fold != fold[one])).any())
 
 
 def recognise(

@@ -234,7 +234,7 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
         for connection, _, data in reader.messages(connections=wanted):
             said: Any = reader.deserialize(data, connection.msgtype)
             place = _PLACES[connection.msgtype](said)
-            stamps.append(_stamp_ns(said.header))
+            stamps.append(int(said.header.stamp.sec) * _NANO + int(said.header.stamp.nanosec))
             places.append((place.x, place.y, place.z))
     place_mm = 1000.0 * np.array(places, np.float64).reshape(-1, 3)
     seen = np.isfinite(place_mm).all(axis=1)  # a tracker that has lost its marker says NaN
@@ -298,10 +298,6 @@ _PLACES: dict[str, Callable[[Any], Any]] = {
     topics.TRANSFORM: lambda said: said.transform.translation,
     topics.POINT: lambda said: said.point,
 }
-
-
-def _stamp_ns(header: Any) -> int:
-    return int(header.stamp.sec) * _NANO + int(header.stamp.nanosec)
 
 
 def _copied(file: BinaryIO, path: Path) -> Path:

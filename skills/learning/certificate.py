@@ -197,6 +197,8 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         optimal, best = optimal_in_scene(mdp_of(policy), policy.greedy, live)
         faint = np.zeros_like(live)
     finishing = finishes(policy)
+    greedy, ties = policy.greedy.astype(np.int64), policy.ties
+    off = None if ties is None else off_rule(mdp_of(policy), best, greedy, policy.moves, ties)
     covered = coverage(policy, finishing)
     share = covered.share
     certificate = Certificate(
@@ -211,7 +213,7 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         median_share=float(np.median(share)),
         demonstration_reproduced=np.array_equal(policy.replay.states, policy.path.states),
         faint=int(np.count_nonzero(faint)),
-        off_rule=_off_rule(policy, best),
+        off_rule=off,
     )
     return certificate, covered
 
@@ -317,13 +319,6 @@ def _achieved(policy: Policy) -> tuple[Floats, Floats]:
         return q[np.arange(len(q)), policy.greedy.astype(np.int64).clip(0)], q.max(axis=1)
     best = exact_values(mdp)
     return action_values(mdp, best, policy.moves), best
-
-
-def _off_rule(policy: Policy, values: Floats) -> int | None:
-    """Return the number of actions that the policy's rule does not select; None if it has no rule."""
-    if policy.ties is None:
-        return None
-    return off_rule(mdp_of(policy), values, policy.greedy.astype(np.int64), policy.moves, policy.ties)
 
 
 def finishes(policy: Policy) -> Flags:

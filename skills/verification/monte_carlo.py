@@ -383,20 +383,23 @@ def estimate_success(
     thin = [looked_at(scene, varied.stretches) for scene in scenes]
     under = [errors, *(one for one in (CALIBRATED, UNCALIBRATED) if one != errors)]
     spared = [size for size in CALLED if getattr(errors, size) > 0]
-    found = [
-        _judged(scene, draws, approach_m, under, [errors.without(size) for size in spared], varied, allowed)
-        for scene, draws in zip(thin, _draws(thin, seed, varied), strict=True)
-    ]
-    whole = np.logical_and.reduce([one.succeeds for one in found])
+    sizes = {"suture_point_mm": varied.suture_point_mm, "needle_rad": varied.needle_rad}
+    draws = [draw(seed, k, varied.variations, len(scene.phase), **sizes) for k, scene in enumerate(thin)]
+    without = [errors.without(size) for size in spared]
+    faults, succeeds = zip(
+        *(_judged(*one, approach_m, under, without, varied, allowed) for one in zip(thin, draws, strict=True)),
+        strict=True,
+    )
+    whole = np.logical_and.reduce(succeeds)
     costs = [Cost(size, share(~good)) for size, good in zip([*spared, NEEDLE], whole, strict=False)]
     return SuccessEstimate(
         seed=seed,
         pad_top_mm=None if pad_top_mm is None else top_mm,
         with_psm_m=trajectory.psm_m is not None,
-        hand_offs=sum("place" in one.faults for one in found),
+        hand_offs=sum("place" in one for one in faults),
         looked_at=tuple(len(scene.phase) for scene in thin),
         under=tuple(
-            counted([{name: one[k] for name, one in each.faults.items()} for each in found], one)
+            counted([{name: one[k] for name, one in each.items()} for each in faults], one)
             for k, one in enumerate(under)
         ),
         settings=varied,
@@ -407,24 +410,7 @@ def estimate_success(
     )
 
 
-def _draws(scenes: Sequence[PlannedPass], seed: int, varied: EstimateSettings) -> list[Drawn]:
-    sizes = {"suture_point_mm": varied.suture_point_mm, "needle_rad": varied.needle_rad}
-    return [draw(seed, k, varied.variations, len(scene.phase), **sizes) for k, scene in enumerate(scenes)]
-
-
 # ---- one pass --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Judged:
-    """A pass in N variations.
-
-    `faults` has for each judged fault whether it occurs under each of E errors, shape (E, N); `succeeds` has the
-    success without one size of the stated errors each, and last with a needle that stands as planned, shape (C, N).
-    """
-
-    faults: dict[str, Flags]
-    succeeds: Flags
 
 
 def _judged(
@@ -435,8 +421,13 @@ def _judged(
     spared: Sequence[ArmErrors],
     varied: EstimateSettings,
     limits: Limits,
-) -> _Judged:
-    """Judge a pass under some errors, and whether it succeeds under the `spared` ones."""
+) -> tuple[dict[str, Flags], Flags]:
+    """Judge a pass in N variations under some errors, and whether it succeeds under the `spared` ones.
+
+    Returns:
+        For each judged fault whether it occurs under each of E errors, shape (E, N); and the success without one size
+        of the stated errors each, and last with a needle that stands as planned, shape (C, N).
+    """
     displaced = [drawn.under(one, scene.stamps_s) for one in [*under, *spared]]
     arms = at_hand_off(scene, approach_m, varied.unknown_depth_mm)
     missed: dict[str, Flags] = {}
@@ -453,7 +444,7 @@ def _judged(
     spoilt = np.logical_or.reduce(list(found.values()))
     good = ~(lost | spoilt)[len(under) :]
     faults = {name: one[: len(under)] for name, one in (found | missed).items()}
-    return _Judged(faults, np.concatenate([good, ~(upright | spoilt[0])[None]]))
+    return faults, np.concatenate([good, ~(upright | spoilt[0])[None]])
 
 
 def at_hand_off(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: float) -> tuple[Planned, Planned] | None:

@@ -145,7 +145,10 @@ class _Moved:
             vague = [self._compare(some, every) for some in self._portions(rows)]
             rows = np.concatenate([np.empty(0, np.int64), *vague])
         answers = np.where(self.no, "no", np.where(self.yes, "yes", "in doubt")).tolist()
-        figures = {name: [_figure(value) for value in values.tolist()] for name, values in self.figures.items()}
+        figures = {
+            name: [value if isfinite(value) else None for value in values.tolist()]
+            for name, values in self.figures.items()
+        }
         return [
             ReachPlace(
                 position_mm=xyz(position),
@@ -331,10 +334,6 @@ class _Looks:
 def _with_last(steps: Floats) -> Floats:
     """Return steps, (T - 1, B), with one more row, so that there is one for each sample."""
     return np.concatenate([steps, np.zeros_like(steps[:1])])
-
-
-def _figure(value: float) -> float | None:
-    return value if isfinite(value) else None
 
 
 def _joints(poses: Poses, by_mm: Floats, tool: kinematics.InstrumentConstants) -> tuple[Floats, Flags]:

@@ -248,7 +248,7 @@ def judge(
         # Negated, so that a NaN margin counts as unreachable.
         unreachable_samples=int(np.count_nonzero(~(psm_a.margins >= -1e-9).all(axis=1))),
         least_margin=float(psm_a.margins.min()),
-        least_margin_joint=kinematics.JOINTS[int(np.argmin(_lowest(psm_a.margins)))],
+        least_margin_joint=kinematics.JOINTS[int(np.nan_to_num(psm_a.margins, nan=-np.inf).min(axis=0).argmin())],
         least_insertion_mm=float(psm_a.joints[:, kinematics.INSERTION].min()),
         peak_speed_ratio=float(psm_a.speed.max()),
         peak_acceleration_ratio=float(psm_a.acceleration.max()),
@@ -443,8 +443,3 @@ def _angles_deg(approach: Floats, jaw: Floats) -> tuple[float, float]:
 def _least(playback: Playback, other: str) -> float:
     columns = [k for k, pair in enumerate(playback.link_pairs) if pair.other == other]
     return float(playback.clearances_mm[:, columns].min())
-
-
-def _lowest(margins: Floats) -> Floats:
-    """Return each joint's least margin, with NaN as the least of all."""
-    return np.asarray(np.where(np.isnan(margins), -np.inf, margins).min(axis=0))
