@@ -48,7 +48,7 @@ from math import exp, log
 import numpy as np
 
 from skills.arithmetic import wilson
-from skills.arrays import Flags, Floats, Ints, freeze
+from skills.arrays import Flags, Floats, Ints, freeze, interpolated
 from skills.comparison.distances import STATES, TREMOR_S, placed, resampled
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
@@ -161,7 +161,7 @@ _COSINES = np.cos(np.pi * np.arange(5)[:, None] * (np.arange(PHASES) + 0.5) / PH
 
 def _at_phases(seconds: Floats, values: Floats) -> Floats:
     """Return the rows of a curve at even phases, shape (PHASES, K)."""
-    return np.stack([np.interp(_PHASE * seconds[-1], seconds, axis) for axis in values.T], axis=1)
+    return interpolated(_PHASE * seconds[-1], seconds, values)
 
 
 def _coefficients(curve: Floats, count: int) -> Floats:

@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import arccos, arcsin, product
-from skills.arrays import Floats, frozen, xyz
+from skills.arrays import Floats, frozen, xyz, xyzw
 from skills.demonstration import hypotheses
 from skills.fields import Count, Point, Quaternion, schema
 from skills.kinematics import INSERTION, JAW_TIP_MM, axes_of, check_rotation, matrix_of, quaternion_of
@@ -383,7 +383,6 @@ def _identified(
     preferred = hypotheses.matching(names, stated) if stated is not None else []
     candidates = tuple(dict.fromkeys(preferred + names))
     first = candidates[0] if candidates else None
-    x, y, z, w = quaternion_of(fit.rotation[None])[0].tolist()
     return Identification(
         verdict=verdict,
         instrument=first,
@@ -392,7 +391,7 @@ def _identified(
         stated=stated,
         in_base=poses.in_base or _is_identity(fit),
         position_mm=xyz(fit.position_mm),
-        rotation_xyzw=(x, y, z, w),
+        rotation_xyzw=xyzw(quaternion_of(fit.rotation[None])[0]),
         residual_mm=fit.residual_mm,
         greatest_mm=float(fit.away_mm.max()),
         residual_rad=None if poses.rotation is None else fit.residual_rad,

@@ -25,6 +25,7 @@ tap of the pedal is a command to the console and no pause.
 """
 
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi
 from typing import Literal
@@ -163,6 +164,23 @@ def spans_of(seconds: Floats, on: Flags) -> list[Span]:
     edges = np.diff(np.concatenate(([False], on, [False])).astype(np.int8))
     starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
     return [(float(seconds[a]), float(seconds[b])) for a, b in zip(starts, ends, strict=True)]
+
+
+def bridged(spans: list[Span], pause_s: float, also: Callable[[float, float], bool] | None = None) -> list[Span]:
+    """Join neighbours whose gap is shorter than a pause.
+
+    Args:
+        spans: Start and end of each interval in s, in order of the starts.
+        pause_s: The shortest gap that divides.
+        also: Return of a longer gap, from its start and its end, whether its neighbours are joined too.
+    """
+    joined: list[Span] = []
+    for start, end in spans:
+        if joined and (start - joined[-1][1] < pause_s or (also and also(joined[-1][1], start))):
+            joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
+        else:
+            joined.append((start, end))
+    return joined
 
 
 def inside(seconds: Floats, spans: list[Span]) -> Flags:

@@ -42,7 +42,7 @@ from numpy.typing import ArrayLike
 
 from skills import kinematics
 from skills.arithmetic import product
-from skills.arrays import Floats, Ints, freeze, frozen
+from skills.arrays import Floats, Ints, freeze, frozen, xyzw
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan, BadSpeed, OutsideGrid
 from skills.fields import Count, schema
@@ -478,8 +478,7 @@ def pose_xyzw(rotation: Floats) -> tuple[float, float, float, float]:
     Args:
         rotation: The rotation, shape (3, 3).
     """
-    x, y, z, w = (float(v) for v in kinematics.quaternion_of(rotation[None])[0])
-    return x, y, z, w
+    return xyzw(kinematics.quaternion_of(rotation[None])[0])
 
 
 @schema

@@ -38,14 +38,14 @@ from skills.demonstration.segments import propose_segments
 from skills.errors import BadInput, BadPath
 from skills.formats import read_recording
 from skills.gridworld import paper
-from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, discretisation_rmse, discretize, fit_grid
+from skills.gridworld.grid import PAPER_GRID, GridPath, discretisation_rmse, discretize, fit_grid
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.certificate import coverage
 from skills.learning.evaluation import Metrics, dtw, measure
 from skills.learning.max_ent_irl import MaxEntIRL, recover_reward
 from skills.learning.policy import Policy, Rollout, learn_tabular, rollout, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.learning.slip_runs import replay
+from skills.learning.slip_runs import leads_to, replay
 from skills.packing import sha256
 from skills.planning.plan import SuturePoint, stack
 from skills.report import rivals
@@ -176,11 +176,7 @@ def starts_reaching(actions: Ints, path: GridPath) -> int:
 
 def steps_of(actions: Ints, path: GridPath) -> Ints:
     """Return the next state of each state, shape (n_states,): itself at the goal, and for a move off the grid."""
-    grid, here = path.grid, np.arange(path.grid.n_states)
-    cells = grid.cells_of(here) + MOVES[actions]
-    on_grid = grid.holds(cells)
-    after = here.copy()
-    after[on_grid] = grid.states_of(cells[on_grid])
+    after = leads_to(path.grid)[np.arange(path.grid.n_states), actions]
     after[path.goal] = path.goal
     return after
 

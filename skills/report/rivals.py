@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from movement_primitives.dmp import DMP
 
-from skills.arrays import Bytes, Floats, Ints
+from skills.arrays import Bytes, Floats, Ints, interpolated
 from skills.gridworld.grid import MOVES, GridPath
 from skills.gridworld.reward import sparse_reward
 from skills.gridworld.slip import STEADY, slip_model
@@ -42,7 +42,7 @@ def learn_primitive(path: GridPath) -> Primitive:
     """Learn a path's primitive by ridge regression; nothing is random."""
     ticks = len(path.states) - 1 + REST_TICKS
     at = np.arange(ticks * STEPS + 1) / STEPS
-    shown_mm = np.column_stack([np.interp(at, np.arange(len(path.states)), axis_mm) for axis_mm in path.tip_mm.T])
+    shown_mm = interpolated(at, np.arange(len(path.states), dtype=np.float64), path.tip_mm)
     primitive = _dmp(path, dimensions=3)
     primitive.imitate(at, shown_mm, regularization_coefficient=RIDGE)
     return Primitive(path, np.array(primitive.forcing_term.weights_))
