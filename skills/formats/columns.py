@@ -9,7 +9,7 @@ arm lags behind. No fault of a setpoint refuses a recording, because nothing is 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,7 @@ Parts = tuple[Floats, ...]
 _TURN_RAD = 2 * np.pi
 _JOINT_RAD = 7.0  # ours: more than any joint turns, less than 8 degrees
 APART_MM = 30.0  # ours: an arm lags by some mm, and by a cell of the paper's grid, 5 mm, at 100 mm/s and 50 ms
+NEAR_SAMPLES = 10_000  # ours: enough for a median, however long the recording is
 
 
 def scaled(values: Floats, factor: float) -> Floats:
@@ -247,14 +248,15 @@ def setpoints_in(
     for (arm, kind), parts in values.items():
         if kind not in SETPOINTS:
             continue
-        topic, pose = topic_of(arm, kind), parts
+        pose = parts
         if kind == "joint_setpoints":
             number = instruments.get(arm)
             if (arm, "local_setpoint") in values or number is None or not np.isfinite(parts[0]).all():
                 why = "not used: the instrument is not known, a number is NaN or infinite, or poses are there too"
-                found.left_out.append((topic, why))
+                found.left_out.append((topic_of(arm, kind), why))
                 continue
-            topic, pose = topic_of(arm, "local_setpoint"), pose_of(parts[0], number)
+            kind, pose = "local_setpoint", pose_of(parts[0], number)
+        topic = topic_of(arm, kind)
         try:
             if kind == "jaw_setpoint":
                 found.jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
@@ -263,7 +265,7 @@ def setpoints_in(
             measured = next((one for one in motions if one.topic == beside), None)
             if measured is None:
                 raise NoUsableTopic(f"{arm} has no measured pose beside it in a known frame.")
-            tip = replace(pose_motion(arm, kind, measured.frame, stamps_ns, pose), topic=topic)
+            tip = pose_motion(arm, kind, measured.frame, stamps_ns, pose)
             _check_near(tip, measured)
             found.tips.append(tip)
         except SkillsError as error:
@@ -283,9 +285,10 @@ def _check_near(tip: Motion, measured: Motion) -> None:
     Raises:
         MixedFrames: Their median distance is above `APART_MM`.
     """
+    step = 1 + len(tip.stamps_ns) // NEAR_SAMPLES
     # samples may have been dropped from either
-    _, here, there = np.intersect1d(tip.stamps_ns, measured.stamps_ns, assume_unique=True, return_indices=True)
-    away_mm = np.linalg.norm(tip.tip_mm[here] - measured.tip_mm[there], axis=1)
+    _, here, there = np.intersect1d(tip.stamps_ns[::step], measured.stamps_ns, assume_unique=True, return_indices=True)
+    away_mm = np.linalg.norm(tip.tip_mm[::step][here] - measured.tip_mm[there], axis=1)
     far_mm = float(np.median(away_mm)) if len(away_mm) else np.nan
     if not far_mm <= APART_MM:
         raise MixedFrames(
