@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
@@ -51,7 +50,6 @@ def draw_styles(styles: Sequence[tuple["DemoPath", "Policy", Sequence["Rollout"]
     """
     rows = ceil(len(styles) / COLUMNS)
     figure = Figure(figsize=(4.4 * min(COLUMNS, len(styles)), 4.3 * rows + 0.3), layout="constrained")
-    FigureCanvasAgg(figure)
     for number, (path, policy, rollouts) in enumerate(styles, start=1):
         _draw_style(space(figure, (rows, COLUMNS, number)), path, policy, rollouts)
     add_legend(figure)
@@ -98,7 +96,6 @@ def draw_all(numbers: Numbers, folder: Path) -> dict[str, Path]:
     for name, draw in DRAWINGS.items():
         files[name] = folder / f"{name}-{numbers.source.name}.png"
         figure = draw(numbers)
-        FigureCanvasAgg(figure)
         figure.savefig(files[name], dpi=DPI)
     return files
 

@@ -353,9 +353,6 @@ def _between_axes(one: tuple[Floats, Floats, float], other: tuple[Floats, Floats
 
 def png(figure: "Figure") -> bytes:
     """Return a figure as a PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
     out = io.BytesIO()
     figure.savefig(out, dpi=DPI, format="png", metadata={"Software": None})
     return out.getvalue()

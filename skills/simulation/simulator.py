@@ -40,7 +40,7 @@ from skills.planning.motion_laws import A1, Poses
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
 from skills.simulation import pictures
 from skills.verification.clearance import Bounds
-from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, Playback, link_pairs, pad_scale
+from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, PAD, Playback, link_pairs, pad_scale
 
 MM = 1e-3
 PLACE, TURN = 4, 5  # indices of the frame in a link's state; 0 and 1 would be its centre of mass
@@ -133,7 +133,6 @@ class Simulator:
 
     def __init__(self, bullet: Any, tool: InstrumentConstants) -> None:
         self.bullet = bullet
-        self.tool = tool
         self.files: dict[str, str] = {}
         self.arm = self._load_arm(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), tool, HOLDING_RAD)
         self.pad: int | None = None
@@ -150,7 +149,7 @@ class Simulator:
         """Place the pad under a trajectory, and PSM_M if it has one."""
         self.place_pad(trajectory.tip_mm, pad_top_mm)
         if (m := trajectory.psm_m) is not None:
-            self.place_psm_m(m.base_mm, m.base_xyzw, m.instrument)
+            self.place_psm_m(m.base_mm, m.base_xyzw, instrument_of(m.instrument))
 
     def place_pad(self, tip_mm: Floats, top_mm: float) -> None:
         """Lay the pad, large enough, under the middle of the path, with its wound along the path's longer side."""
@@ -161,12 +160,11 @@ class Simulator:
         self.pad_mm = np.array([middle[0], middle[1], top_mm])
         self.pad = self._load("suture_pad.urdf", self.pad_mm, quaternion, scale=pad_scale(tip_mm))
 
-    def place_psm_m(self, base_mm: Floats, base_xyzw: Floats, instrument: str | None = None) -> None:
-        """Load PSM_M, in green and with its jaws open, by default with PSM_A's instrument.
+    def place_psm_m(self, base_mm: Floats, base_xyzw: Floats, tool: InstrumentConstants) -> None:
+        """Load PSM_M, in green and with its jaws open.
 
         Collisions between the arms are off, because their distance is measured instead.
         """
-        tool = instrument_of(instrument) if instrument else self.tool
         self.psm_m = self._load_arm(base_mm, base_xyzw, tool, OPEN_RAD)
         links = range(-1, self.bullet.getNumJoints(self.psm_m.number))
         for link in links:
@@ -179,6 +177,12 @@ class Simulator:
         arm = body or self.arm
         # One call for all joints takes a fifth of the time of one call for each.
         self.bullet.resetJointStatesMultiDof(arm.number, arm.joints, in_metres(joints)[:, None].tolist())
+
+    def show(self, trajectory: Trajectory, sample: int) -> None:
+        """Set the joints of the arms in the scene to those of a sample."""
+        self.pose(trajectory.joints[sample])
+        if self.psm_m is not None and trajectory.psm_m is not None:
+            self.pose(trajectory.psm_m.joints[sample], self.psm_m)
 
     # -- measurements and motion --
 
@@ -305,16 +309,11 @@ class Simulator:
             surfaces=tuple(by_link[name] for name in LINKS),
         )
         self.bullet.changeDynamics(number, -1, linearDamping=0.0, angularDamping=0.0)
-        lower, upper = in_metres(tool.lower).tolist(), in_metres(tool.upper).tolist()
-        for joint, index in enumerate(arm.joints):
+        limits = in_metres(np.stack([tool.lower, tool.upper])).T.tolist()
+        for index, (lower, upper) in zip(arm.joints, limits, strict=True):
             # The file has the Classic's limits, a Si has others. A separate call, because with damping in the same call
             # the limits have no effect.
-            self.bullet.changeDynamics(
-                number,
-                index,
-                jointLowerLimit=lower[joint],
-                jointUpperLimit=upper[joint],
-            )
+            self.bullet.changeDynamics(number, index, jointLowerLimit=lower, jointUpperLimit=upper)
         for index in arm.fingers:
             self.bullet.resetJointState(number, index, opening_rad)
         return arm
@@ -327,10 +326,8 @@ def _file(name: str, wrist_mm: float | None) -> Iterator[Path]:
         if wrist_mm is None or abs(wrist_mm - URDF_WRIST_MM) < 1e-6:
             yield path
             return
-        before, after = (
-            f'"0 {URDF_CENTRE_MM * MM:.4f} 0"',
-            f'"0 {(URDF_CENTRE_MM + wrist_mm - URDF_WRIST_MM) * MM:.4f} 0"',
-        )
+        centre_mm = (URDF_CENTRE_MM, URDF_CENTRE_MM + wrist_mm - URDF_WRIST_MM)
+        before, after = (f'"0 {up_mm * MM:.4f} 0"' for up_mm in centre_mm)
         text = path.read_text()
         assert text.count(before) == 1
         with TemporaryDirectory() as folder:
@@ -357,10 +354,7 @@ def simulate(given: BinaryIO, answer: BinaryIO) -> None:
     with opened(motion.instrument, motion.rate_hz) as scene:
         scene.set_up(motion, asked.pad_top_mm)
         kinematic = kinematic_pass(scene, asked)
-        shown = _pictured(motion)
-        scene.pose(motion.joints[shown])
-        if scene.psm_m is not None and motion.psm_m is not None:
-            scene.pose(motion.psm_m.joints[shown], scene.psm_m)
+        scene.show(motion, _pictured(motion))
         picture = pictures.draw(scene.photograph, _paths(motion))
         files, pad_mm = dict(sorted(scene.files.items())), scene.pad_mm
     # In a fresh scene: PSM_M would take two thirds of each step, and earlier contacts influence later steps.
@@ -408,16 +402,7 @@ def kinematic_pass(scene: Simulator, asked: PlayRequest) -> KinematicPass:
         distances.at(k)
     read = _table(values, 6)
     read[:, INSERTION] /= MM
-    looked_at, order = distances.samples()
-    return KinematicPass(
-        tip_mm=_table(places, 3) / MM,
-        rotation_xyzw=_table(turns, 4),
-        joints=read,
-        looked_at=looked_at,
-        clearances_mm=distances.seen_mm()[order],
-        shaft_off_mm=distances.shaft_off_mm()[order],
-        psm_m_tip_mm=None if scene.psm_m is None else distances.psm_m_tip_mm()[order],
-    )
+    return KinematicPass(_table(places, 3) / MM, _table(turns, 4), read, *distances.in_order())
 
 
 def _rows(values: Floats) -> Iterator[Any]:
@@ -461,9 +446,8 @@ class _Distances:
         if scene.psm_m is not None and self._m_joints is not None:
             scene.pose(self._m_joints[sample], scene.psm_m)
             self._m_places.extend(scene.frame_of(scene.psm_m, scene.psm_m.tool)[0])
-        for pair in self._pairs:
-            columns = pair.columns
-            for point in scene.closest(pair.body, pair.other):  # a pair of capsules has one nearest point
+        for bodies, columns in self._pairs.items():
+            for point in scene.closest(*bodies):  # a pair of capsules has one nearest point
                 seen[columns[point[3], point[4]]] = point[8]
         self._samples.append(sample)
         self._seen.extend(seen)
@@ -475,42 +459,26 @@ class _Distances:
         """Return the distances in the order of measurement, shape (C, P)."""
         return _table(self._seen, len(self._nothing)) / MM
 
-    def samples(self) -> tuple[Ints, Ints]:
-        """Return the samples in ascending order, and their places in the order of measurement, shape (C,)."""
+    def in_order(self) -> tuple[Ints, Floats, Floats, Floats | None]:
+        """Return the samples in ascending order, and what a `KinematicPass` has at them."""
         order = np.argsort(self._samples)
-        return np.array(self._samples)[order], order
-
-    def shaft_off_mm(self) -> Floats:
-        """Return the distances of the shaft from its remote centre, in the order of measurement, shape (C,)."""
         place, along = _table(self._shaft_places, 3) / MM, matrix_of(_table(self._shaft_turns, 4))[:, :, 2]
-        return np.asarray(np.linalg.norm(np.cross(place, along), axis=1))
-
-    def psm_m_tip_mm(self) -> Floats:
-        """Return PSM_M's tip in the order of measurement, shape (C, 3)."""
-        return _table(self._m_places, 3) / MM
+        shaft_off_mm = np.linalg.norm(np.cross(place, along), axis=1)
+        m_mm = None if self._scene.psm_m is None else _table(self._m_places, 3)[order] / MM
+        return np.array(self._samples)[order], self.seen_mm()[order], shaft_off_mm[order], m_mm
 
 
-@dataclass(frozen=True)
-class _BodyPair:
-    """Two bodies, and the column of `link_pairs` for each pair of their links' indices."""
-
-    body: int
-    other: int
-    columns: dict[tuple[int, int], int]
-
-
-def _pairs_of_bodies(scene: Simulator) -> list[_BodyPair]:
-    """Return the pairs of bodies in the scene, with columns numbered as in `link_pairs`."""
+def _pairs_of_bodies(scene: Simulator) -> dict[tuple[int, int], dict[tuple[int, int], int]]:
+    """Return for each pair of bodies in the scene the column of `link_pairs` for each pair of their links' indices."""
     assert scene.pad is not None
-    on_pad = range(len(LINKS))
-    found = [_BodyPair(scene.arm.number, scene.pad, {(a, -1): k for k, a in enumerate(scene.arm.surfaces)})]
-    if scene.psm_m is not None:
-        both = [(a, m) for a in scene.arm.surfaces for m in scene.psm_m.surfaces]
-        columns = {pair: len(on_pad) + k for k, pair in enumerate(both)}
-        found.append(_BodyPair(scene.arm.number, scene.psm_m.number, columns))
-        first = len(on_pad) + len(both)
-        under_m = {(m, -1): first + k for k, m in enumerate(scene.psm_m.surfaces)}
-        found.append(_BodyPair(scene.psm_m.number, scene.pad, under_m))
+    places = {(PAD, PAD): (scene.pad, -1)}
+    for name, arm in ((PSM_A, scene.arm), (PSM_M, scene.psm_m)):
+        if arm is not None:
+            places |= {(name, link): (arm.number, index) for link, index in zip(LINKS, arm.surfaces, strict=True)}
+    found: dict[tuple[int, int], dict[tuple[int, int], int]] = {}
+    for column, pair in enumerate(link_pairs(scene.psm_m is not None)):
+        (body, link), (other, other_link) = places[pair.body, pair.link], places[pair.other, pair.other_link]
+        found.setdefault((body, other), {})[link, other_link] = column
     return found
 
 

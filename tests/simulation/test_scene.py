@@ -127,7 +127,7 @@ def test_distances_to_the_pad_are_those_of_the_capsules_lowest_points():
 
 def test_distances_between_arms_are_those_of_the_capsules_axes():
     with simulator.opened("400006", 240.0) as one:
-        one.place_psm_m(np.array([50.0, 10.0, 0.0]), np.array([0.0, 0.17, 0.0, 0.985444]))
+        one.place_psm_m(np.array([50.0, 10.0, 0.0]), np.array([0.0, 0.17, 0.0, 0.985444]), instrument_of("400006"))
         assert one.psm_m is not None
         rng = np.random.default_rng(6)
         for _ in range(40):
