@@ -69,7 +69,7 @@ class Bag:
     """A bag on this machine: its files in order, its metadata.yaml and its stages."""
 
     files: tuple[Path, ...]
-    metadata: Path | None = None
+    metadata: bag_folder.Metadata | None = None
     labels: tuple[Label, ...] = ()
 
     @property
@@ -113,7 +113,7 @@ def find_bag(path: Path) -> Bag:
     ordered = bag_folder.in_order(sorted(names, key=_by_number), known) if known else sorted(names, key=_by_number)
     return Bag(
         files=tuple(names[name] for name in ordered),
-        metadata=metadata if known else None,
+        metadata=known,
         labels=_labels_in(path),
     )
 
@@ -179,7 +179,7 @@ def _can_be_rewritten(file: Path) -> bool:
 
 def _check(bag: Bag, topics: Sequence[Topic]) -> None:
     if bag.metadata is not None:
-        bag_folder.check_counts(bag_folder.read_metadata(bag.metadata.read_text(errors="replace")), topics)
+        bag_folder.check_counts(bag.metadata, topics)
 
 
 def _plain_file(file: Path, folder: Path) -> Path:

@@ -124,8 +124,8 @@ class _Moved:
         by, count = positions_mm - np.array(one.point.position_mm), len(positions_mm)
         self.yes, self.no = np.ones(count, bool), np.zeros(count, bool)
         self.because: list[str | None] = [None] * count
-        self.figures = {name: np.full(count, np.nan) for name in ("bodies", "tools", "scene", "needle")}
-        self.figures |= {name: np.full(count, np.inf) for name in ("turn", "insertion")}
+        self.figures = {f"{name}_mm": np.full(count, np.nan) for name in ("bodies", "tools", "scene", "needle")}
+        self.figures |= {name: np.full(count, np.inf) for name in ("turn_margin_deg", "insertion_margin_mm")}
         self.joints = self._solved(poses.arms[0], by, PSM_A, plan.instrument)
         self.other, psm_m = None, plan.psm_m
         if len(poses.arms) == 2 and psm_m is not None:
@@ -145,25 +145,13 @@ class _Moved:
             vague = [self._compare(some, every) for some in self._portions(rows)]
             rows = np.concatenate([np.empty(0, np.int64), *vague])
         answers = np.where(self.no, "no", np.where(self.yes, "yes", "in doubt")).tolist()
-        figures = {
-            name: [value if isfinite(value) else None for value in values.tolist()]
-            for name, values in self.figures.items()
-        }
-        return [
-            ReachPlace(
-                position_mm=xyz(position),
-                rotation_xyzw=self.one.point.rotation_xyzw,
-                reach=answers[k],
-                limited_by=self.because[k],
-                turn_margin_deg=figures["turn"][k],
-                insertion_margin_mm=figures["insertion"][k],
-                bodies_mm=figures["bodies"][k],
-                tools_mm=figures["tools"][k],
-                scene_mm=figures["scene"][k],
-                needle_mm=figures["needle"][k],
+        found = []
+        for k, position in enumerate(self.positions):
+            figures = {name: float(one[k]) if isfinite(one[k]) else None for name, one in self.figures.items()}
+            found.append(
+                ReachPlace(xyz(position), self.one.point.rotation_xyzw, answers[k], self.because[k], **figures)
             )
-            for k, position in enumerate(self.positions)
-        ]
+        return found
 
     # ---- joints ----------------------------------------------------------------------------------------------------
 
@@ -186,7 +174,8 @@ class _Moved:
             mine, spare = margin[:, :, joint], step[:, :, joint]
             no = ~(mine + np.where(beyond[:, None], 0.0, spare) >= 0).all(axis=1) & (smooth[:, joint] | beyond)
             yes = (mine - spare >= 0).all(axis=1) & smooth[:, joint]
-            figure, unit = ("insertion", 1.0) if joint == kinematics.INSERTION else ("turn", 180 / pi)
+            turns = joint != kinematics.INSERTION
+            figure, unit = ("turn_margin_deg", 180 / pi) if turns else ("insertion_margin_mm", 1.0)
             least = np.minimum(self.figures[figure], mine.min(axis=1) * unit)
             self._judge(np.arange(len(q)), _Check(f"{arm}'s {name}", yes, no, figure, least))
         self.no |= beyond
@@ -280,7 +269,7 @@ class _Moved:
                 "scene",
                 np.all([one.yes for one in found], axis=0),
                 np.any([one.no for one in found], axis=0),
-                "scene",
+                "scene_mm",
                 np.min([one.least for one in found], axis=0),
             )
         if scene.tissue is not None:
@@ -328,7 +317,8 @@ class _Looks:
         least = seen.min(axis=axes)
         lower = ((seen[:, :-1] + seen[:, 1:] - np.diff(gone, axis=1)) / 2).min(axis=axes)
         slack = np.maximum(look_mm, TICK * way.max(axis=axes))
-        return _Check(name, np.minimum(lower, least) - slack >= limit_mm, ~(least + slack >= limit_mm), name, least)
+        yes, no = np.minimum(lower, least) - slack >= limit_mm, ~(least + slack >= limit_mm)
+        return _Check(name, yes, no, f"{name}_mm", least)
 
 
 def _with_last(steps: Floats) -> Floats:
