@@ -373,12 +373,17 @@ def _wrong_frame(poses: _Poses, free: _Fit) -> Identification:
         f"the poses are stated to be relative to the arm's base, but the joints put the base at ({x:.1f}, {y:.1f}, "
         f"{z:.1f}) mm in their frame, turned by {turn:.1f} degrees"
     )
-    found = _identified(replace(poses, in_base=False), free, "wrong frame", [], None, None)
-    return replace(found, reason=reason, instrument=None, generation=None)
+    return _identified(replace(poses, in_base=False), free, "wrong frame", [], None, reason=reason)
 
 
 def _identified(
-    poses: _Poses, fit: _Fit, verdict: Verdict, names: list[str], stated: str | None, next_mm: float | None
+    poses: _Poses,
+    fit: _Fit,
+    verdict: Verdict,
+    names: list[str],
+    stated: str | None,
+    next_mm: float | None = None,
+    reason: str = "",
 ) -> Identification:
     preferred = hypotheses.matching(names, stated) if stated is not None else []
     candidates = tuple(dict.fromkeys(preferred + names))
@@ -398,7 +403,7 @@ def _identified(
         delay_s=poses.delay_s,
         next_mm=next_mm,
         samples=len(poses.tip_mm),
-        reason="",
+        reason=reason,
     )
 
 
@@ -425,16 +430,15 @@ def _not_explained(poses: _Poses, best: _Fit, stated: str | None) -> Identificat
             return replace(_wrong_frame(poses, free), stated=stated)
     elif _fits_in_pieces(poses):
         reason = "each part of the recording fits by itself, but not all together: the frame of the poses moved"
-        found = _identified(poses, best, "moved frame", [], stated, None)
-        return replace(found, reason=reason)
+        return _identified(poses, best, "moved frame", [], stated, reason=reason)
     turn = "" if poses.rotation is None else f" and {np.degrees(best.residual_rad):.1f} degrees"
     reason = (
         "no known arm and instrument puts the tip where the poses have it: the best is off by "
         f"{best.residual_mm:.2f} mm{turn} (root mean square)"
     )
     hint = next((words for words, tried in _explanations(poses) if min(map(_misfit, _fits(tried))) < _BETTER), None)
-    found = _identified(poses, best, "contradiction", [], stated, None)
-    return replace(found, reason=reason if hint is None else f"{reason}; they would agree {hint}")
+    reason = reason if hint is None else f"{reason}; they would agree {hint}"
+    return _identified(poses, best, "contradiction", [], stated, reason=reason)
 
 
 _BETTER = FIT_MM + LEVER_MM * FIT_RAD

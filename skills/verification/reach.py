@@ -145,12 +145,10 @@ class _Moved:
             vague = [self._compare(some, every) for some in self._portions(rows)]
             rows = np.concatenate([np.empty(0, np.int64), *vague])
         answers = np.where(self.no, "no", np.where(self.yes, "yes", "in doubt")).tolist()
-        found = []
+        found, turned = [], self.one.point.rotation_xyzw
         for k, position in enumerate(self.positions):
             figures = {name: float(one[k]) if isfinite(one[k]) else None for name, one in self.figures.items()}
-            found.append(
-                ReachPlace(xyz(position), self.one.point.rotation_xyzw, answers[k], self.because[k], **figures)
-            )
+            found.append(ReachPlace(xyz(position), turned, answers[k], self.because[k], **figures))
         return found
 
     # ---- joints ----------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from skills.arrays import Flags, Floats, Ints, interpolated
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.movement import same_signs
+from skills.demonstration.movement import runs, same_signs
 from skills.kinematics import angle_between, instrument_of, matrix_of
 
 # Ours: planning averages a hand over a quarter of a second, and its tip twice.
@@ -99,9 +99,8 @@ def _spread(values: Floats, half: int) -> tuple[Floats, Floats]:
 
 def _unbroken_s(slow: Flags) -> Floats:
     """Return the length of the run of slow moments around each, within `HALF_S` of it, shape (N,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], slow, [False])).astype(np.int8)))
-    runs = np.zeros(len(slow))
-    for begin, end in edges.reshape(-1, 2).tolist():
-        runs[begin:end] = (end - begin) * _STEP_S
+    lasting = np.zeros(len(slow))
+    for begin, end in runs(slow):
+        lasting[begin:end] = (end - begin) * _STEP_S
     half = 2 * round(HALF_S / _STEP_S)
-    return np.asarray(sliding_window_view(np.pad(runs, half), 2 * half + 1).max(axis=1))
+    return np.asarray(sliding_window_view(np.pad(lasting, half), 2 * half + 1).max(axis=1))
