@@ -26,7 +26,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 
@@ -201,13 +201,14 @@ def _table(file: BinaryIO) -> Floats:
     file.seek(0)
     if not first:
         raise UnreadableRecording("The kinematics file is empty.")
-    form: dict[str, Any] = {"delimiter": ",", "skiprows": 1} if first.strip() == HEADER else {}
+    comma, heads = (",", 1) if first.strip() == HEADER else (None, 0)
     try:
-        table = np.loadtxt(file, np.float64, comments=None, ndmin=2, max_rows=ROWS + 1, encoding="utf-8", **form)
+        table = np.loadtxt(
+            file, comments=None, delimiter=comma, skiprows=heads, ndmin=2, max_rows=ROWS + 1, encoding="utf-8"
+        )
     except (ValueError, UnicodeDecodeError) as error:
-        raise UnreadableRecording(
-            f"{_wrong_row(file, **form)} JIGSAWS kinematics have {COLUMNS} numbers per row."
-        ) from error
+        where = _wrong_row(file, comma, heads)
+        raise UnreadableRecording(f"{where} JIGSAWS kinematics have {COLUMNS} numbers per row.") from error
     if table.shape[1:] != (COLUMNS,) or len(table) > ROWS:
         raise UnreadableRecording(
             f"The table has {table.shape[1]} columns and {len(table)} rows; JIGSAWS kinematics have {COLUMNS} columns "
@@ -238,11 +239,11 @@ def _check_sides(table: Floats) -> None:
                 )
 
 
-def _wrong_row(file: BinaryIO, delimiter: str | None = None, skiprows: int = 0) -> str:
+def _wrong_row(file: BinaryIO, comma: str | None, heads: int) -> str:
     """Return a description of the first invalid row, with its position."""
     file.seek(0)
     for number, line in enumerate(file, start=1):
-        cells = line.strip().split(None if delimiter is None else delimiter.encode()) if number > skiprows else []
+        cells = line.strip().split(comma and comma.encode()) if number > heads else []
         if cells and len(cells) != COLUMNS:
             return f"Row {number} has {len(cells)} cells."
         for column, cell in enumerate(cells, start=1):
