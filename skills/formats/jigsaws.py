@@ -243,7 +243,7 @@ def _wrong_row(file: BinaryIO, comma: str | None, heads: int) -> str:
     """Return a description of the first invalid row, with its position."""
     file.seek(0)
     for number, line in enumerate(file, start=1):
-        cells = line.strip().split(comma and comma.encode()) if number > heads else []
+        cells = line.strip().split(comma.encode() if comma else None) if number > heads else []
         if cells and len(cells) != COLUMNS:
             return f"Row {number} has {len(cells)} cells."
         for column, cell in enumerate(cells, start=1):
