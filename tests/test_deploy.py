@@ -53,7 +53,7 @@ def test_every_path_that_is_copied_exists_and_so_does_the_python():
             assert all((ROOT / name).exists() for name in said.split()[:-1]), said
 
 
-def test_what_is_installed_is_checked_by_its_hashes_and_comes_from_no_compiler():
+def test_installs_are_checked_by_hashes_and_need_no_compiler():
     installs = [said for said in of("RUN") if "pip install" in said]
     assert len(installs) == 2
     assert "--require-hashes --only-binary :all: -r /src/requirements-serve.lock" in installs[0]

@@ -75,8 +75,8 @@ class Verdict(PlaybackReport):
     """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
 
     Attributes:
-        failure_in_words: The failure as a sentence.
-        doubt: Probabilities of success in worlds that differ from the plan.
+        failure_sentence: The failure as a sentence.
+        estimate: Probabilities of success in worlds that differ from the plan.
         plan: Digest of the plan.
         trajectory: Digest of the stamps and joints that were checked.
         policy: The policy version that the plan follows.
@@ -87,8 +87,8 @@ class Verdict(PlaybackReport):
         check_version: Version of the checks; a bag is given only of the present one.
     """
 
-    failure_in_words: str | None
-    doubt: SuccessEstimate
+    failure_sentence: str | None
+    estimate: SuccessEstimate
     plan: Sha256
     trajectory: Sha256
     policy: PolicyName

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StrictBool, StrictInt
 
-from skills.comparison.combining import COMBININGS, Combining
+from skills.comparison.combining import Combining
 from skills.fields import Count, Fraction, Sha256, Slug, schema
 from skills.gridworld.hazards import SceneCosts, Surroundings
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
@@ -29,7 +29,7 @@ LearnerIn: Any = Annotated[reduce(or_, map(_learner, LEARNERS.values())), Field(
 class CombineIn(Schema):
     """The way several demonstrations are combined into one path (docs/combining.md)."""
 
-    kind: Literal["medoid", "barycentre", "corridor"]
+    kind: Combining
 
 
 class TrainingIn(Schema):
@@ -86,7 +86,7 @@ class TrainingIn(Schema):
     @property
     def combining(self) -> Combining | None:
         """The way of combining as a value of the domain."""
-        return None if self.combine is None else COMBININGS[self.combine.kind]()
+        return None if self.combine is None else self.combine.kind
 
 
 class RetrainingIn(Schema):

@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
+from skills.comparison.combining import Combining
 from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import ALL_ROWS
@@ -164,7 +165,7 @@ class TrainingRequest(TypedDict):
     near: dict[str, float]  # of the gate
     seed: int
     release: bool
-    combine: NotRequired[dict[str, str]]  # of several demonstrations
+    combine: NotRequired[dict[Literal["kind"], Combining]]  # of several demonstrations
     outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
     depth_along: NotRequired[list[float]]  # in a frame that is not the base of the arm
     surroundings: NotRequired[dict[str, Any]]  # the scene and its costs

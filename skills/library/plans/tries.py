@@ -422,7 +422,7 @@ def _play(database: Database, asked: TryIn, plan: str, actor: str, settings: Set
         playback = store(session, actor)["playback"]
     with database.reading() as session:
         row = find_playback(session, playback)
-    errors = row.report.doubt.under[0].errors.name
+    errors = row.report.estimate.under[0].errors.name
     words = f"{row.report.samples} samples in the simulator, and 1000 worlds with {describe_errors(errors)}."
     return playback, words
 
