@@ -28,12 +28,7 @@ commands = typer.Typer()
 
 
 @command(commands)
-def atlas(
-    suture: Suture,
-    scaled: bool = False,
-    clusters: int | None = None,
-    demo: str | None = None,
-) -> Answer:
+def atlas(suture: Suture, scaled: bool = False, clusters: int | None = None, demo: str | None = None) -> Answer:
     """Compare all demonstrations of a suture type: clusters, differences between surgeons, and recognition.
 
     Args:
@@ -105,10 +100,7 @@ def _say_recognised(found: "Atlas") -> None:
 
 
 @command(commands)
-def recognise(
-    recording: str,
-    suture: TheSuture,
-) -> Answer:
+def recognise(recording: str, suture: TheSuture) -> Answer:
     """Recognise the surgeon of a whole recording by all its movements, with its session left out.
 
     Args:
@@ -132,11 +124,7 @@ def _rounded(distance: float | None) -> str | None:
 
 @command(commands, without=("demo", "recording"))
 def score(
-    what: str,
-    surgeon: TheSurgeon,
-    suture: TheSuture,
-    options: ScoreKeywords,
-    proposal: int | None = None,
+    what: str, surgeon: TheSurgeon, suture: TheSuture, options: ScoreKeywords, proposal: int | None = None
 ) -> Answer:
     """Score a motion against a style: its distance, where it deviates, and its percentiles. Not a credential.
 
@@ -199,9 +187,7 @@ def _show_score(scored: "Score") -> None:
 
 @command(commands)
 def progress(
-    surgeon: Surgeon,
-    suture: TheSuture,
-    against: Annotated[str, typer.Option(autocompletion=complete_surgeons)],
+    surgeon: Surgeon, suture: TheSuture, against: Annotated[str, typer.Option(autocompletion=complete_surgeons)]
 ) -> Answer:
     """Compare a surgeon's demonstrations with a style's reference, session by session. Not a credential.
 

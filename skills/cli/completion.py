@@ -23,14 +23,12 @@ MOST = 200
 
 def complete_surgeons(incomplete: str) -> list[str]:
     """Return the surgeons that complete an input."""
-    return _in_time(lambda: _found(lambda client: [one.surgeon for one in client.surgeons()], "Surgeon"), incomplete)
+    return _in_time(lambda: _found(lambda client: [one.surgeon for one in client.surgeons()], "surgeons"), incomplete)
 
 
 def complete_sutures(incomplete: str) -> list[str]:
     """Return the suture types that complete an input."""
-    return _in_time(
-        lambda: _found(lambda client: [one.suture for one in client.suture_types()], "SutureType"), incomplete
-    )
+    return _in_time(lambda: _found(lambda client: [one.suture for one in client.suture_types()], "sutures"), incomplete)
 
 
 def _in_time(find: Callable[[], list[str]], incomplete: str) -> list[str]:
@@ -55,8 +53,8 @@ def _end_without(thread: Thread) -> None:
         os._exit(0)
 
 
-def _found(served: "Callable[[Client], list[str]]", row: Literal["Surgeon", "SutureType"]) -> list[str]:
-    """Return names from the service, if one is configured, else from the rows in the database, if it exists."""
+def _found(served: "Callable[[Client], list[str]]", of: Literal["surgeons", "sutures"]) -> list[str]:
+    """Return names from the service, if one is configured, else from the database, if it exists."""
     from skills.settings import settings
 
     if settings().server:
@@ -68,10 +66,10 @@ def _found(served: "Callable[[Client], list[str]]", row: Literal["Surgeon", "Sut
     file = url.removeprefix("sqlite:///")
     if file != url and not Path(file).is_file():
         return []
-    from sqlalchemy import select
+    from skills.library.people.surgeons import list_surgeons
+    from skills.library.people.suture_types import list_suture_types
 
-    from skills.db import models
-
-    slugs = getattr(models, row).slug
     with installation(patience_ms=int(LIMIT_S * 1000)) as database, database.reading() as session:
-        return list(session.scalars(select(slugs).order_by(slugs).limit(MOST)))
+        if of == "surgeons":
+            return [row.slug for row in list_surgeons(session, MOST, None)]
+        return [row.slug for row in list_suture_types(session, MOST, None)]

@@ -103,10 +103,7 @@ def demo_show(demo: Demo) -> Answer:
 
 
 @command(demos, "report")
-def demo_report(
-    demo: Demo,
-    html: Path | None = None,
-) -> Answer:
+def demo_report(demo: Demo, html: Path | None = None) -> Answer:
     """Report the quality of a demonstration, and how to improve it.
 
     Args:
@@ -129,11 +126,7 @@ def demo_save(demo: Demo, to: ToFile) -> Answer:
 
 
 @command(demos, "mark")
-def demo_mark(
-    demo: Demo,
-    outcome: Literal["success", "recovery", "failure"],
-    reason: str | None = None,
-) -> Answer:
+def demo_mark(demo: Demo, outcome: Literal["success", "recovery", "failure"], reason: str | None = None) -> Answer:
     """Mark a demonstration; a recovery or a failure is not learnt from, and releases that rest on it are withdrawn.
 
     Args:
@@ -152,10 +145,7 @@ def _outcome(demo: "Demonstration") -> list[str]:
 
 
 @command(demos, "withdraw")
-def demo_withdraw(
-    demo: Demo,
-    erase: bool = False,
-) -> Answer:
+def demo_withdraw(demo: Demo, erase: bool = False) -> Answer:
     """Withdraw a demonstration and the releases that rest on it.
 
     Args:

@@ -17,9 +17,7 @@ COLUMNS = ("id", "kind", "state", "progress", "created_at", "error")
 
 
 @command(jobs, "list")
-def job_list(
-    state: Literal["queued", "running", "succeeded", "failed", "cancelled"] | None = None,
-) -> Answer:
+def job_list(state: Literal["queued", "running", "succeeded", "failed", "cancelled"] | None = None) -> Answer:
     """List jobs, the newest first.
 
     Args:
@@ -37,10 +35,7 @@ def job_show(job: JobId) -> Answer:
 
 
 @command(jobs, "wait")
-def job_wait(
-    job: JobId,
-    timeout_s: float = 600.0,
-) -> Answer:
+def job_wait(job: JobId, timeout_s: float = 600.0) -> Answer:
     """Wait until a job has ended; exit code 1 if it did not succeed.
 
     Args:

@@ -98,9 +98,7 @@ def migrate() -> Answer:
 
 
 @command(commands)
-def seed(
-    to: Annotated[Path | None, typer.Option("--files", file_okay=False)] = None,
-) -> Answer:
+def seed(to: Annotated[Path | None, typer.Option("--files", file_okay=False)] = None) -> Answer:
     """Load the synthetic sample surgeons and their recordings.
 
     Args:
@@ -133,9 +131,7 @@ def backup(to: Annotated[Path, typer.Argument(dir_okay=False)]) -> Answer:
 
 @command(commands)
 def restore(
-    source: Annotated[Path, typer.Argument(dir_okay=False)],
-    erasures: Lists = None,
-    check: bool = False,
+    source: Annotated[Path, typer.Argument(dir_okay=False)], erasures: Lists = None, check: bool = False
 ) -> Answer:
     """Fill an empty database from a backup, and repeat everything that was ended since the backup.
 
@@ -216,9 +212,7 @@ def _again(sources: list[str], ended: dict[str, int]) -> str:
 
 
 @command(commands)
-def erasures(
-    to: Path,
-) -> Answer:
+def erasures(to: Path) -> Answer:
     """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`.
 
     Args:
@@ -241,10 +235,7 @@ def verify(
     bag: Annotated[Path | None, typer.Argument()] = None,
     decode_all: bool = False,
     head: Annotated[Path | None, typer.Option(dir_okay=False)] = None,
-    key: Annotated[
-        str | None,
-        typer.Option(help=KEY),
-    ] = None,
+    key: Annotated[str | None, typer.Option(help=KEY)] = None,
     relearn: bool = False,
     limit: Annotated[int | None, typer.Option(min=1)] = None,
 ) -> Answer:
@@ -273,11 +264,7 @@ def verify(
     from skills.transparency.notes import read_notes
 
     found: dict[str, Checked] = {}
-    with (
-        installation() as database,
-        confined_reader(settings()) as reader,
-        status_line("verifying") as update,
-    ):
+    with installation() as database, confined_reader(settings()) as reader, status_line("verifying") as update:
         heads = None if head is None else read_notes(head.read_text())
         sign_some_history(database)
         for part in inspect_installation(
@@ -317,9 +304,7 @@ def state_of(part: "Checked") -> str:
 
 
 @command(commands, "public-key")
-def public_key(
-    to: Annotated[Path | None, typer.Argument(dir_okay=False)] = None,
-) -> Answer:
+def public_key(to: Annotated[Path | None, typer.Argument(dir_okay=False)] = None) -> Answer:
     """Print the public key of the service, which verifies bags, policies, cards and the history offline.
 
     Args:

@@ -18,10 +18,7 @@ COLUMNS = ("surgeon", "skill_level", "handedness", "protocol", "created_at")
 
 @command(surgeons, "put")
 def surgeon_put(
-    surgeon: str,
-    about: SurgeonKeywords,
-    consent: list[str] | None = None,
-    until: str | None = None,
+    surgeon: str, about: SurgeonKeywords, consent: list[str] | None = None, until: str | None = None
 ) -> Answer:
     """Create or replace a surgeon; options that are left out are cleared.
 
@@ -58,10 +55,7 @@ def suture_list() -> Answer:
 
 
 @command(commands)
-def erase(
-    surgeon: Surgeon,
-    yes: bool = False,
-) -> Answer:
+def erase(surgeon: Surgeon, yes: bool = False) -> Answer:
     """Erase a surgeon and everything derived from their data, permanently.
 
     Args:

@@ -136,9 +136,7 @@ def _drawn(found: "Reach") -> list[str]:
 
 
 @command(commands)
-def plans(
-    plan_id: Annotated[str | None, typer.Argument(metavar="PLAN")] = None,
-) -> Answer:
+def plans(plan_id: Annotated[str | None, typer.Argument(metavar="PLAN")] = None) -> Answer:
     """List plans, the newest first, or show one.
 
     Args:
@@ -155,10 +153,7 @@ def plans(
 
 @command(commands)
 def play(
-    plan_id: PlanId,
-    errors: str | None = None,
-    picture: Path | None = None,
-    pictures: Path | None = None,
+    plan_id: PlanId, errors: str | None = None, picture: Path | None = None, pictures: Path | None = None
 ) -> Answer:
     """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible.
 

@@ -85,12 +85,7 @@ def train(
 
 
 @command(commands)
-def retrain(
-    options: RetrainingKeywords,
-    learner: Learner = None,
-    setting: Setting = None,
-    join: Join = None,
-) -> Answer:
+def retrain(options: RetrainingKeywords, learner: Learner = None, setting: Setting = None, join: Join = None) -> Answer:
     """Learn many styles again, and wait for them; exit code 1 if one failed, or with --release was not released."""
     if (chosen := _learner(learner, setting or [], join)) is not None:
         options["learner"] = chosen
@@ -278,10 +273,7 @@ def policy_withdraw(surgeon: Surgeon, suture: Suture) -> Answer:
 
 @command(policies, "export")
 def policy_export(
-    surgeon: Surgeon,
-    suture: Suture,
-    to: Annotated[Path, typer.Argument(dir_okay=False)],
-    version: OneVersion = None,
+    surgeon: Surgeon, suture: Suture, to: Annotated[Path, typer.Argument(dir_okay=False)], version: OneVersion = None
 ) -> Answer:
     """Write the released policy, or a version, to a file, after verifying every number of it against its digest.
 
@@ -295,10 +287,7 @@ def policy_export(
 
 @command(policies, "card")
 def policy_card(
-    surgeon: Surgeon,
-    suture: Suture,
-    version: TheVersion,
-    to: Annotated[Path, typer.Argument(dir_okay=False)],
+    surgeon: Surgeon, suture: Suture, version: TheVersion, to: Annotated[Path, typer.Argument(dir_okay=False)]
 ) -> Answer:
     """Write the card of a version: its data, learner, figures, limits, and everything that it rests on.
 
@@ -357,10 +346,7 @@ def policy_verify(
 
 @command(commands)
 def rollout(
-    surgeon: Surgeon,
-    suture: Suture,
-    start: Annotated[str, typer.Option()],
-    version: OneVersion = None,
+    surgeon: Surgeon, suture: Suture, start: Annotated[str, typer.Option()], version: OneVersion = None
 ) -> Answer:
     """Follow the released policy from a position to the goal.
 

@@ -65,10 +65,7 @@ def recording_add(
 
 @command(recordings, "preview")
 def recording_preview(
-    path: RecordingPath,
-    about: TableKeywords,
-    episode: OneEpisode = None,
-    tool: Tool = None,
+    path: RecordingPath, about: TableKeywords, episode: OneEpisode = None, tool: Tool = None
 ) -> Answer:
     """Show what would be understood of a recording, above all of a table; nothing is stored."""
     with service() as client, ready_one(path, about, episode, tool) as (file, progress):
@@ -192,10 +189,7 @@ HEADINGS = ("recording", "source", "stated", "format", "samples", "understood", 
 
 
 @command(recordings, "table")
-def recording_table(
-    folder: Annotated[Path, typer.Argument(file_okay=False)],
-    stated: Path | None = None,
-) -> Answer:
+def recording_table(folder: Annotated[Path, typer.Argument(file_okay=False)], stated: Path | None = None) -> Answer:
     """Show what would be understood of each recording in a folder, and why others are refused; nothing is stored.
 
     Args:

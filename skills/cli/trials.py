@@ -57,10 +57,7 @@ def jigsaws_add(
 
 
 @command(jigsaws, "evaluate")
-def jigsaws_evaluate(
-    folder: Annotated[Path, typer.Argument(file_okay=False)],
-    task: Tasks = None,
-) -> Answer:
+def jigsaws_evaluate(folder: Annotated[Path, typer.Argument(file_okay=False)], task: Tasks = None) -> Answer:
     """Compare the hand-offs proposed from both hands' motion with the transcribed ones; nothing is stored.
 
     Args:

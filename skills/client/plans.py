@@ -117,9 +117,7 @@ class Plans(Connection):
         return await self._get(Comparison, "/plans/{plan}/comparison", plan=plan, demo=demo, **{"pass": pass_index})
 
     async def play(
-        self,
-        plan: str,
-        errors: "Literal['calibrated', 'uncalibrated'] | ArmErrorsIn | Mapping[str, Any] | None" = None,
+        self, plan: str, errors: "Literal['calibrated', 'uncalibrated'] | ArmErrorsIn | Mapping[str, Any] | None" = None
     ) -> Job:
         """Request the playback of a plan in the simulator; the job's result is a `PlaybackResult`.
 
