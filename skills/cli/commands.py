@@ -156,7 +156,7 @@ def _with_help(parameter: inspect.Parameter, helps: Mapping[str, str]) -> inspec
         info = typer.Argument()
     else:  # a switch alone, where Typer would add its negation
         info = typer.Option(*[f"--{parameter.name.replace('_', '-')}"] * (kind is bool))
-    info = copy(info)
+    info = copy(info)  # several commands may share it
     info.help = helps[parameter.name]
     return parameter.replace(annotation=Annotated[kind, info])
 

@@ -145,7 +145,7 @@ def mark_demo(demo: Digest, body: OutcomeIn, db: Db, give: Giving, actor: Actor,
 def withdraw_demo(demo: Digest, db: Db, jobs: Jobs, caller: Asking, conditions: IfMatch, erase: bool = False) -> None:
     """Withdraw a demonstration and the releases that rest on it; with `erase`, delete it and its derived data."""
     if erase:
-        caller.must_be("admin")
+        caller.must_be("admin")  # before anything is looked up, as the role of a route is
     dropped: erasure.Dropped = []
     with db.reading() as session:
         found = demos.find_demo(session, demo)
