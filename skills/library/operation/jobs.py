@@ -309,6 +309,11 @@ def did_nothing(job: Job) -> str:
     return f"Nothing: an equal job {'has succeeded' if job.state == 'succeeded' else f'is {job.state}'} already."
 
 
+def requested(job: Job, new: bool) -> RequestedJob:
+    """Return a requested job with the effect of the request: it is queued, or existed."""
+    return RequestedJob(job, new, QUEUED if new else did_nothing(job))
+
+
 def refuse_too_many(session: Session, actor: str, most: int) -> None:
     """Refuse more work for an actor who already has `most` jobs queued or running; a batch counts as one.
 

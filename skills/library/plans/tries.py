@@ -82,7 +82,7 @@ def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
         # What it reported may have been withdrawn or erased since, so it is tried again, not looked up.
         request["again"] = secrets.token_hex(8)
     job, new = jobs.ask(session, TRY, request, surgeon, actor)
-    return RequestedJob(job, new, jobs.QUEUED if new else jobs.did_nothing(job))
+    return jobs.requested(job, new)
 
 
 def perform_try(database: Database, request: dict[str, Any], settings: Settings) -> Store:
