@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StrictBool, StrictInt
 
-from skills.comparison.combining import COMBININGS, Combining
 from skills.fields import Count, Fraction, Sha256, Slug, schema
 from skills.gridworld.hazards import SceneCosts, Surroundings
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
@@ -92,11 +91,6 @@ class TrainingIn(Schema):
             return None
         costs = SceneCosts() if self.scene_costs is None else SceneCosts(**self.scene_costs.model_dump())
         return Surroundings(self.scene.value, costs)
-
-    @property
-    def combining(self) -> Combining | None:
-        """The way of combining as a value of the domain."""
-        return None if self.combine is None else COMBININGS[self.combine.kind]()
 
 
 class RetrainingIn(Schema):

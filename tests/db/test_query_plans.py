@@ -17,7 +17,7 @@ from skills.library.operation.installation import count_jobs
 from skills.library.operation.overview import newest_job
 from skills.library.operation.styles import matrix, released_styles
 from skills.library.people import surgeons, suture_types
-from skills.library.policies import answers, batches, learning, retraining, training, versions
+from skills.library.policies import answers, learning, releases, retraining, training, versions
 from skills.library.recordings import demos, proposals
 from skills.schemas.training import RetrainingIn, TrainingIn
 from tests import backends
@@ -82,9 +82,9 @@ HOT: dict[str, Callable[[Session], object]] = {
     "a version by its digest": lambda s: versions.find_by_digest(s, versions.policy_of(s, *STYLE).policy.sha256),
     "a training": lambda s: training.request_training(s, TrainingIn(surgeon=STYLE[0], suture=STYLE[1]), "test"),
     "a surgeon's stale styles": lambda s: retraining.choose_styles(s, RetrainingIn(surgeon=STYLE[0], only_stale=True)),
-    "where what was learnt stands": lambda s: s.execute(learning.DEMO_STATES, {"demonstrations": [1, 2, 3]}).all(),
-    "what is known already": lambda s: s.execute(learning.KNOWN, {"digests": ["0" * 64, "1" * 64]}).all(),
-    "what some styles serve": lambda s: s.execute(batches.SERVED, {"demonstrations": [1, 2, 3]}).all(),
+    "where what was learnt stands": lambda s: learning.demo_states(s, [1, 2, 3]),
+    "what is known already": lambda s: learning.find_stored(s, ["0" * 64, "1" * 64]),
+    "what some styles serve": lambda s: releases.served_versions(s, {(1, "simple-running"), (2, "simple-running")}),
     "jobs": lambda s: jobs.list_jobs(s, 10, 50, None),
     "jobs of a state": lambda s: jobs.list_jobs(s, 10, 50, "failed"),
     "jobs of a kind": lambda s: jobs.list_jobs(s, 10, 50, None, "playback"),

@@ -23,6 +23,7 @@ from skills.library.policies import training
 from skills.library.policies.cards import card_of
 from skills.library.policies.combined import learnt_from, path_of
 from skills.library.policies.releases import in_force, release
+from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import upload_demo, withdraw_demo
 from skills.schemas.demos import DemoIn
@@ -140,11 +141,12 @@ def test_erasing_any_of_them_erases_the_policy(database: Database, how, gone):
 )
 def test_one_that_leaves_while_it_is_learnt_from_leaves_no_policy(database: Database, leave, why):
     demos = add_three(database)
-    request = cases.ask_training(database, demos=[demo.sha256 for demo in demos]).request
+    job = cases.ask_training(database, demos=[demo.sha256 for demo in demos])
+    request = TrainingRequest.model_validate(job.request)
     with database.reading() as session:
         read = training.lessons(session, [demo.row for demo in demos])
     learnt_meanwhile = training.learn_style(
-        training.combined_lesson(read, Corridor()), request, Settings(database_url=database.url)
+        training.combined_lesson(read, request.combine), request, Settings(database_url=database.url)
     )
     with database.writing() as session:
         leave(session, demos[0].sha256, "test")

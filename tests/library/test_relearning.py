@@ -1,7 +1,7 @@
 """`skills verify --relearn`: certificates and policies computed again agree, and consistent changes are named."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import NotFound
 from skills.formats.parsed import parse_recording
-from skills.learning.certificate import NearLimits
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNER_VERSION
@@ -27,6 +26,7 @@ from skills.library.operation.integrity import demo_identity, poses_identity_of
 from skills.library.policies.gate import GATE_VERSION
 from skills.library.policies.learning import certified, lessons
 from skills.library.policies.relearning import compute_again, decoded
+from skills.library.policies.requests import request_of
 from skills.library.recordings.demos import mark_demo
 from skills.schemas.policies import PolicyManifest
 from skills.settings import Settings
@@ -133,7 +133,7 @@ def test_other_actions_with_certificate_and_digests_are_named(database):
     q = policy.q.copy()
     q[policy.domain.certified] *= 1.0 + 1e-12
     forged = replace(policy, q=q)
-    made = certified(lesson, {**_request(manifest), "release": False}, demo, forged)
+    made = certified(lesson, request_of(manifest), demo, forged)
     rewritten(database, 1, forged, made.manifest)
     with tampering(database) as connection:
         connection.execute(
@@ -172,11 +172,6 @@ def test_another_motion_of_the_other_arm_with_its_digest_is_named(tmp_path: Path
     ((name, why),) = parts(database)[RELEARNT].wrong
     assert name == "policy_versions 1" and why.endswith("the other arm's motion in its pose style")
     database.close()
-
-
-def _request(manifest: PolicyManifest) -> dict[str, Any]:
-    names = ("surgeon", "suture", "demos", "seed", "learner_version")
-    return {name: getattr(manifest, name) for name in names} | {"gate": GATE_VERSION, "near": asdict(NearLimits())}
 
 
 def test_a_demonstration_other_than_its_recording_is_named(database):

@@ -23,7 +23,7 @@ from skills.learning.certificate import NearLimits, certify, near_starts
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.library.policies import gate, learning, releases, retraining, training
+from skills.library.policies import gate, learning, releases, requests
 from skills.schemas.people import Consent
 from skills.schemas.policies import GateRefusal
 from tests.formats.bags import sample_folder
@@ -99,14 +99,14 @@ def test_a_pass_beyond_a_limit_is_refused_with_place_joint_and_amount(database):
 def test_a_batch_of_stale_styles_takes_what_an_older_gate_refused(database, monkeypatch):
     trained(database, reaching(138.5))
     assert styles_of(database, ask_retraining(database, only_stale=True)) == []
-    monkeypatch.setattr(retraining, "GATE_VERSION", retraining.GATE_VERSION + 1)
+    monkeypatch.setattr(requests, "GATE_VERSION", requests.GATE_VERSION + 1)
     (style,) = styles_of(database, ask_retraining(database, only_stale=True))
     assert style.stale == ["refused by an older gate"]
 
 
 def test_a_release_refused_by_an_older_gate_is_learnt_again_on_request(database, monkeypatch):
     """A training under today's gate has another job identity, so that the old refusal is not returned for it."""
-    monkeypatch.setattr(training, "GATE_VERSION", training.GATE_VERSION - 1)
+    monkeypatch.setattr(requests, "GATE_VERSION", requests.GATE_VERSION - 1)
     old = trained(database, reaching(135))
     monkeypatch.undo()
     assert cases.train(database).version == old.version + 1

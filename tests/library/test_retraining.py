@@ -16,7 +16,7 @@ from skills.library.operation import jobs
 from skills.library.operation.jobs import BATCH
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
-from skills.library.policies import batches, retraining
+from skills.library.policies import batches, requests, retraining
 from skills.library.policies.batches import compare
 from skills.library.policies.learning import learn_style
 from skills.library.recordings.demos import withdraw_demo
@@ -109,9 +109,9 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
     cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)))
     assert reasons() == [["a newer demonstration"]]
     assert reasons(learner=ValueIteration(), surgeon="kestrel") == [["other settings"]]
-    monkeypatch.setattr(retraining, "GATE_VERSION", retraining.GATE_VERSION + 1)
+    monkeypatch.setattr(requests, "GATE_VERSION", requests.GATE_VERSION + 1)
     assert reasons(surgeon="surgeon-0") == []  # an accepted version stays; for the rest see test_release_gate
-    monkeypatch.setattr(retraining, "LEARNER_VERSION", retraining.LEARNER_VERSION + 1)
+    monkeypatch.setattr(requests, "LEARNER_VERSION", requests.LEARNER_VERSION + 1)
     assert sorted(reasons()) == [["a newer learner"]] * 2 + [["other settings", "a newer learner"]]
     with database.writing() as session:  # the newest version's demonstration is gone: the one before counts again
         newest = session.scalars(select(PolicyVersion).order_by(PolicyVersion.row.desc())).first()

@@ -14,8 +14,9 @@ even if several workers train it. The batch ends in the same transaction as its 
 
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
+from pydantic import BaseModel, ConfigDict
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
@@ -30,12 +31,13 @@ from skills.library.people.consent import require
 from skills.library.policies.releases import is_served
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
+from skills.schemas.operation import JobResult
 from skills.schemas.training import StoredComparison
 
-BATCH, PART = "retraining", "retraining-part"
+TRAINING, BATCH, PART = "training", "retraining", "retraining-part"
 EXPORT, PICTURES = "dataset", "pictures"
 ACTIVE = ("queued", "running")
-Store = Callable[[Session, str], dict[str, Any]]  # stores a result in a transaction, on behalf of this actor
+Store = Callable[[Session, str], JobResult]  # stores a result in a transaction, on behalf of this actor
 # For statements that change many rows: no object of the session has to follow, so none is searched for.
 UNSYNCHRONISED: Any = {"execution_options": {"synchronize_session": False}}
 Rows = Sequence[int] | Select[int]  # at most as many as a statement may have parameters, or a query
@@ -148,87 +150,33 @@ QUEUED = "A new job is queued."  # `RequestedJob.did` of a new job
 JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 
 
-JOIN_AS_SERVED = "as served"  # `joins` of a batch in which each style keeps the joining rule of its served policy
+class JobRequest(BaseModel):
+    """The request of a job, all defaults resolved: the base class of those of each kind.
+
+    Fields that are None are not stored, so that one which is added later changes no identity.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+    kind: ClassVar[str]
+
+    @property
+    def stored(self) -> dict[str, Any]:
+        """The plain JSON in the job's row."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    @property
+    def identity(self) -> str:
+        """The digest of the kind and of all inputs."""
+        return identity_of(self.kind, self.stored)
 
 
-class TrainingRequest(TypedDict):
-    """The request of a training's job, all defaults resolved; its digest is the identity of the training."""
-
-    surgeon: str
-    suture: str
-    demos: list[str]
-    learner: dict[str, Any]
-    learner_version: int
-    gate: int
-    poses: int
-    near: dict[str, float]  # of the gate
-    seed: int
-    release: bool
-    combine: NotRequired[dict[str, str]]  # of several demonstrations
-    outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
-    depth_along: NotRequired[list[float]]  # in a frame that is not the base of the arm
-    surroundings: NotRequired[dict[str, Any]]  # the scene and its costs
-    odds: NotRequired[dict[str, float]]  # of the gate in a scene
-
-
-class RetrainingRequest(TypedDict):
-    """The request of a batch's job: the settings that its styles share, and the digest of what they are learnt from."""
-
-    surgeon: str | None
-    suture: str | None
-    only_stale: bool
-    learner: dict[str, Any]
-    learner_version: int
-    gate: int
-    poses: int
-    near: dict[str, float]
-    odds: dict[str, float]
-    joins: str | None  # `JOIN_AS_SERVED`; None where the request names a learner
-    seed: int
-    release: bool
-    styles: NotRequired[int]
-    demos_sha256: NotRequired[str]
-    after: NotRequired[str]  # the equal batch whose styles serve something else now
-
-
-class PartRequest(TypedDict):
+class PartRequest(JobRequest):
     """The request of a part of a batch: the rows of both jobs, no personal data."""
+
+    kind: ClassVar[str] = PART
 
     retraining: int
     part: int
-
-
-class PlaybackRequest(TypedDict):
-    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under."""
-
-    plan: str
-    check_version: int
-    errors: dict[str, Any]
-    stated_by: Literal["request", "installation"]
-
-
-class PicturesRequest(TypedDict):
-    """The request of the pictures of a playback; erasing a demonstration finds the job by the plan."""
-
-    plan: str
-    playback: str
-
-
-class DatasetRequest(TypedDict):
-    """The request of an export's job: the contents of its README, and the digest of its demonstrations and splits."""
-
-    name: str
-    version: str
-    fps: int
-    arms: list[str]
-    whole: bool
-    split: str
-    licence: str
-    description: str
-    procedure: str
-    consent: str  # in words, without a pseudonym
-    episodes: int
-    demos_sha256: str
 
 
 class RequestedJob(NamedTuple):
@@ -239,35 +187,33 @@ class RequestedJob(NamedTuple):
     did: str
 
 
-def ask(
-    session: Session, kind: str, request: Mapping[str, object], surgeon: Surgeon | None, actor: str
-) -> tuple[Job, bool]:
+def ask(session: Session, request: JobRequest, surgeon: Surgeon | None, actor: str) -> tuple[Job, bool]:
     """Queue work whose inputs are all resolved; return the job, and whether it is new.
 
     An equal request that is queued, running or done returns the same job; after a failed or cancelled one a new job is
     queued.
     """
-    known = find_live(session, kind, request)
+    known = find_live(session, request)
     if known is not None:
         return known, False
     job = Job(
         id=secrets.token_hex(8),
-        kind=kind,
-        identity=identity_of(kind, request),
-        request={**request},
-        plan=request.get("plan"),
+        kind=request.kind,
+        identity=request.identity,
+        request=request.stored,
+        plan=request.stored.get("plan"),
         surgeon_row=surgeon.row if surgeon else None,
         requested_by=actor,
     )
     session.add(job)
     session.flush()
-    record_event(session, actor, "ask", f"job-{kind}", job.id, surgeon)
+    record_event(session, actor, "ask", f"job-{job.kind}", job.id, surgeon)
     return job, True
 
 
-def find_live(session: Session, kind: str, request: Mapping[str, object]) -> Job | None:
+def find_live(session: Session, request: JobRequest) -> Job | None:
     """Return the job of an equal request that is queued, running or done, even if the caller may not see it."""
-    alike = select(Job).where(Job.identity == identity_of(kind, request), Job.state.in_(LIVE))
+    alike = select(Job).where(Job.identity == request.identity, Job.state.in_(LIVE))
     # All rows, not only the caller's: an equal job must not be queued twice.
     return session.scalar(alike.execution_options(**ALL_ROWS))
 
@@ -292,9 +238,9 @@ def while_running(database: Database, row: int, attempt: int) -> Database:
     return database.on_condition(check, [locks.job(row)] if names is None else names)
 
 
-def progress_callback(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
+def progress_callback(database: Database, request: JobRequest) -> Callable[[float], None]:
     """Return a callback that stores the progress of a running job, in the database of `while_running`."""
-    mine = (Job.identity == identity_of(kind, request), Job.state == "running")
+    mine = (Job.identity == request.identity, Job.state == "running")
 
     def tell(share: float) -> None:
         with database.writing(()) as session:
@@ -324,7 +270,7 @@ def refuse_too_many(session: Session, actor: str, most: int) -> None:
 
 
 def identity_of(kind: str, request: Mapping[str, object]) -> str:
-    """Return the identity of a request: the digest of its kind and of all its inputs."""
+    """Return the identity of a request as it is stored: the digest of its kind and of all its inputs."""
     return sha256(canonical([kind, request]))
 
 
@@ -336,9 +282,9 @@ def shown() -> list[ColumnElement[bool]]:
     return [Job.kind != PART, of_job.is_(None)]
 
 
-def newest(session: Session, kind: str, request: Mapping[str, object]) -> Job | None:
+def newest(session: Session, request: JobRequest) -> Job | None:
     """Return the newest job with exactly this request, in any state."""
-    mine = select(Job).where(Job.identity == identity_of(kind, request))
+    mine = select(Job).where(Job.identity == request.identity)
     return session.scalar(mine.order_by(Job.row.desc()).limit(1))
 
 

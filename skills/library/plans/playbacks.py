@@ -7,8 +7,7 @@ current state of the policy's release, and it is the replay bag that is refused 
 """
 
 from collections.abc import Callable
-from dataclasses import asdict
-from typing import Any
+from typing import ClassVar, Literal
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -19,7 +18,7 @@ from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest, learnt, planned
-from skills.library.operation.jobs import PlaybackRequest
+from skills.library.operation.jobs import JobRequest
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.plans.headline import CHECK_VERSION, headline
 from skills.library.plans.plans import check_frame, find_plan, hand_of, trajectory_of
@@ -28,9 +27,21 @@ from skills.library.policies import releases, versions
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
 from skills.schemas.playbacks import FollowedPolicy, Headline, PictureLinks, Playback, Verdict, finite
+from skills.schemas.results import PlaybackResult
 from skills.settings import Settings
 from skills.verification.arm_errors import ArmErrors
 from skills.verification.verdict import judge_plan
+
+
+class PlaybackRequest(JobRequest):
+    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under."""
+
+    kind: ClassVar[str] = "playback"
+
+    plan: str
+    check_version: int
+    errors: ArmErrors
+    stated_by: Literal["request", "installation"]
 
 
 def request_playback(
@@ -53,22 +64,22 @@ def request_playback(
     versions.followable(plan.policy)
     check_frame(plan.about.frame)
     request = playback_request(plan.sha256, settings, errors)
-    return jobs.ask(session, "playback", request, plan.policy.surgeon, actor)
+    return jobs.ask(session, request, plan.policy.surgeon, actor)
 
 
 def playback_request(plan_sha256: str, settings: Settings, errors: ArmErrors | None) -> PlaybackRequest:
     """Return the request of a playback's job, all defaults resolved; the arguments are those of `request_playback`."""
-    return {
-        "plan": plan_sha256,
-        "check_version": CHECK_VERSION,
-        "errors": asdict(stated_errors(settings.arm_errors) if errors is None else errors),
-        "stated_by": "installation" if errors is None else "request",
-    }
+    return PlaybackRequest(
+        plan=plan_sha256,
+        check_version=CHECK_VERSION,
+        errors=stated_errors(settings.arm_errors) if errors is None else errors,
+        stated_by="installation" if errors is None else "request",
+    )
 
 
 def check_playback(
     database: Database, request: PlaybackRequest, settings: Settings
-) -> Callable[[Session, str], dict[str, Any]]:
+) -> Callable[[Session, str], PlaybackResult]:
     """Play a plan in the simulator, judge it, and estimate its probability of success by Monte Carlo.
 
     The returned function stores all of it.
@@ -76,35 +87,34 @@ def check_playback(
     from skills.simulation.player import play
 
     with database.reading() as session:
-        stored = find_plan(session, request["plan"])
+        stored = find_plan(session, request.plan)
         plan, policy = planned(stored), PolicyName.model_validate(stored.policy)
         followed, demo = learnt(stored.policy), hand_of(stored.policy)
     check_frame(plan.frame)
     trajectory = trajectory_of(plan)
     measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
-    errors = ArmErrors(**request["errors"])
-    verdict = judge_plan(plan, trajectory, measured, policy=followed, demo=demo, errors=errors)
+    verdict = judge_plan(plan, trajectory, measured, policy=followed, demo=demo, errors=request.errors)
     report = finite(
         Verdict(
             **vars(verdict.report),
             doubt=verdict.success,
-            stated_by=request["stated_by"],
-            check_version=request["check_version"],
+            stated_by=request.stated_by,
+            check_version=request.check_version,
             failure_in_words=verdict.failure_sentence,
             scene=verdict.scene,
             tissue="not given" if plan.scene is None or plan.scene.tissue is None else "judged",
-            plan=request["plan"],
+            plan=request.plan,
             trajectory=digest(trajectory),
             policy=policy,
             frame=plan.frame,
         )
     )
 
-    def store(session: Session, actor: str) -> dict[str, Any]:
+    def store(session: Session, actor: str) -> PlaybackResult:
         # A retry of the job computes the same report and digest, and must not store it twice.
         known = session.scalar(select(StoredPlayback).where(StoredPlayback.sha256 == report.identity))
         if known is None:
-            plan = find_plan(session, request["plan"])
+            plan = find_plan(session, request.plan)
             known = StoredPlayback(
                 sha256=report.identity, plan=plan, feasible=report.feasible, report=report, measured=measured
             )
@@ -112,7 +122,7 @@ def check_playback(
             record_event(session, actor, "play", "playback", report.identity, plan.policy.surgeon)
             session.flush()
             request_pictures(session, known, actor)
-        return {"playback": known.sha256, "feasible": known.feasible}
+        return PlaybackResult(playback=known.sha256, feasible=known.feasible)
 
     return store
 

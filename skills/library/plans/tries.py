@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from math import ceil
-from typing import Any
+from typing import Any, ClassVar
 
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
@@ -32,7 +32,7 @@ from skills.formats.parsed import ParsedContent
 from skills.gridworld import paper
 from skills.gridworld.grid import PathReport, choose_grid, describe_path, discretize
 from skills.library.operation import jobs, locks
-from skills.library.operation.jobs import RequestedJob, Store, identity_of
+from skills.library.operation.jobs import JobRequest, RequestedJob, Store
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
@@ -54,6 +54,7 @@ from skills.library.recordings.recordings import Parser, confined_reader, find_r
 from skills.remedies import Remedy
 from skills.schemas.demos import DemoIn
 from skills.schemas.plans import PlanIn, SuturePointIn
+from skills.schemas.results import TryResult
 from skills.schemas.training import TrainingIn
 from skills.schemas.tries import Choice, StepName, TryIn, TryStep
 from skills.settings import Settings
@@ -63,6 +64,14 @@ TRY = "try"
 CELLS_MM = (paper.CELL_MM, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)  # ours, from the paper's to what a recording can resolve
 MOST_CHOICES = 20
 STEPS = 10  # of a try that is not stopped, for its progress
+
+
+class TryRequest(JobRequest, TryIn):
+    """The request of a try's job; `again` is unique to a try that is repeated after its end."""
+
+    kind: ClassVar[str] = TRY
+
+    again: str | None = None
 
 
 def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
@@ -76,36 +85,37 @@ def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
     require(surgeon, "training")
     recording = find_recording(session, asked.recording).sha256  # in full: the argument may be a prefix
     find_suture_type(session, asked.suture)
-    request = asked.model_dump(mode="json", exclude_none=True) | {"recording": recording}
-    known = jobs.find_live(session, TRY, request)
+    request = TryRequest(**dict(asked) | {"recording": recording})
+    known = jobs.find_live(session, request)
     if known is not None and known.state == "succeeded":
         # What it reported may have been withdrawn or erased since, so it is tried again, not looked up.
-        request["again"] = secrets.token_hex(8)
-    job, new = jobs.ask(session, TRY, request, surgeon, actor)
+        request = request.model_copy(update={"again": secrets.token_hex(8)})
+    job, new = jobs.ask(session, request, surgeon, actor)
     return RequestedJob(job, new, jobs.QUEUED if new else jobs.did_nothing(job))
 
 
-def perform_try(database: Database, request: dict[str, Any], settings: Settings) -> Store:
+def perform_try(database: Database, request: TryRequest, settings: Settings) -> Store:
     """Carry out a try, and write each of its steps into the running job's result.
 
     Raises:
         SkillsError: A step was refused; the job's result has the steps up to it.
     """
-    asked = TryIn.model_validate({name: value for name, value in request.items() if name != "again"})
-    mine = Job.identity == identity_of(TRY, request), Job.state == "running"
+    mine = Job.identity == request.identity, Job.state == "running"
     with database.reading() as session:
         actor = session.scalar(select(Job.requested_by).where(*mine)) or ""
-    told: list[dict[str, Any]] = []
+    so_far = TryResult()
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if the recording is not cached
-        for step in try_recording(database, asked, actor, settings, reader.parse):
-            told.append(step.model_dump(mode="json"))
+        for step in try_recording(database, request, actor, settings, reader.parse):
+            so_far = TryResult(steps=(*so_far.steps, step))
+            progress = min(len(so_far.steps) / STEPS, 0.95)
             with database.writing(()) as session:
-                so_far = {"result": {"steps": told}, "progress": min(len(told) / STEPS, 0.95)}
-                session.execute(update(Job).where(*mine).values(**so_far))
+                session.execute(
+                    update(Job).where(*mine).values(result=so_far.model_dump(mode="json"), progress=progress)
+                )
 
-    def store(_session: Session, _actor: str) -> dict[str, Any]:
-        return {"steps": told}
+    def store(_session: Session, _actor: str) -> TryResult:
+        return so_far
 
     return store
 
@@ -419,7 +429,7 @@ def _play(database: Database, asked: TryIn, plan: str, actor: str, settings: Set
     """Play a plan in the simulator; return the playback's digest, and the step in words."""
     store = check_playback(database, playback_request(plan, settings, asked.arm_errors), settings)
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
-        playback = store(session, actor)["playback"]
+        playback = store(session, actor).playback
     with database.reading() as session:
         row = find_playback(session, playback)
     errors = row.report.doubt.under[0].errors.name

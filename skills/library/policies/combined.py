@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
-from skills.comparison.combining import COMBININGS, Combined, Combining, Corridor, Followed, followed
+from skills.comparison.combining import COMBININGS, Combined, Combining, Followed, followed
 from skills.db.models import Demonstration, PolicyVersion, Surgeon
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, Conflict
@@ -16,11 +16,11 @@ from skills.gridworld.grid import GridPath
 from skills.library.recordings.demos import find_demo, newest_demos
 from skills.remedies import Action, Remedy
 from skills.schemas.policies import Combined as CombinedFigures
+from skills.schemas.training import CombineIn
 
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
 
-
-BEST = Corridor()  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
+BEST = CombineIn(kind="corridor")  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
 
 
 def choose_demos(

@@ -14,17 +14,14 @@ from sqlalchemy.orm import Session
 
 from skills.db.models import PolicyVersion, Release, Surgeon
 from skills.db.service_tables import Job, StyleToRetrain
+from skills.library.operation.jobs import TRAINING
 from skills.library.people.consent import refusal
 from skills.library.policies.gate import remedy
-from skills.library.policies.releases import Released, is_served
+from skills.library.policies.releases import Released, Style, is_served
 from skills.schemas import operation as schemas
 from skills.schemas.operation import ServedNow
 from skills.schemas.policies import GateRefusal
 from skills.schemas.training import RetrainedStyle, ServedTraining, StyleComparison, TrainingResult
-
-TRAINING = "training"
-
-Style = tuple[int, str]  # a surgeon's row and a suture type's slug
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ job takes its result from here: `released` and `now_released` are the present st
 job.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -56,6 +56,8 @@ from skills.library.policies.fit import compare_versions, format_mm, not_worse
 from skills.library.policies.gate import join_reasons, remedy
 from skills.planning.plan import CONSTANT_TURN_DEG, departure_of
 from skills.schemas.policies import GateRefusal
+
+Style = tuple[int, str]  # a surgeon's row and a suture type's slug
 
 
 def _newest_leaf(table: type[Release | Surgeon]) -> ScalarSelect[Any]:
@@ -121,6 +123,14 @@ def serves(session: Session, policy: PolicyVersion) -> bool:
     """Return whether a policy version is the one that its style serves."""
     now = served(session, policy.surgeon, policy.suture)
     return now is not None and now.policy_row == policy.row
+
+
+def served_versions(session: Session, styles: Collection[Style]) -> dict[Style, PolicyVersion]:
+    """Return the versions that some styles serve, with one statement; styles that serve nothing are left out."""
+    query = select(PolicyVersion).join(Release, Release.policy_row == PolicyVersion.row)
+    mine = Release.surgeon_row.in_({who for who, _ in styles}), Release.suture.in_({suture for _, suture in styles})
+    found = session.scalars(query.where(*mine, is_served()))
+    return {(one.surgeon_row, one.suture): one for one in found}
 
 
 def shares_served(session: Session, suture: str) -> dict[str, float]:

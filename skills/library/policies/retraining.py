@@ -5,7 +5,7 @@
 
 import secrets
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import ColumnElement, Text, cast, func, insert, select, update
@@ -17,24 +17,21 @@ from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.learning.certificate import NearLimits, OddsLimits
-from skills.learning.policy import LEARNER_VERSION, describe_learner, learner_of
 from skills.library.operation import jobs, locks
-from skills.library.operation.jobs import (
-    BATCH,
-    JOIN_AS_SERVED,
-    PART,
-    PartRequest,
-    RequestedJob,
-    RetrainingRequest,
-    did_nothing,
-)
+from skills.library.operation.jobs import BATCH, PART, PartRequest, RequestedJob, did_nothing
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
-from skills.library.policies.gate import GATE_VERSION, limits_of
-from skills.library.policies.outcomes import Style
-from skills.library.policies.served_settings import ServedSettings, in_pieces, learner_for, settings_of_served
-from skills.library.policies.training import POSES_VERSION, learner_to_train
+from skills.library.policies.releases import Style
+from skills.library.policies.requests import (
+    JOIN_AS_SERVED,
+    RetrainingRequest,
+    TrainingRequest,
+    in_pieces,
+    request_of,
+    requests_of_served,
+)
+from skills.library.policies.training import learner_to_train
 from skills.library.recordings.demos import newest_demos
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
@@ -93,7 +90,7 @@ def request_retraining(
     names = [] if batch.surgeon is None else [locks.surgeon(batch.surgeon)]
     with database.writing([locks.BATCHES, *names]) as session:
         who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
-        job, new = jobs.ask(session, BATCH, request, who, actor)
+        job, new = jobs.ask(session, request, who, actor)
         if not new:
             return RequestedJob(job, False, _did_nothing(session, job))
     # Rows are inserted only for a new job; an equal one has its own.
@@ -113,7 +110,7 @@ def request_retraining(
     if not styles:
         return RequestedJob(told, True, "Nothing: no style needs training.")
     counted = f"{len(styles)} {'style' if len(styles) == 1 else 'styles'}"
-    why = " that serve another version than when an equal batch ended" if "after" in request else ""
+    why = " that serve another version than when an equal batch ended" if request.after else ""
     return RequestedJob(told, True, f"A new job is queued, of {counted}{why}.")
 
 
@@ -134,57 +131,54 @@ def choose_styles(
         add = Remedy(Action.ADD_DEMO, surgeon=batch.surgeon or "SURGEON", suture=batch.suture or "SUTURE")
         why = "There is no active demonstration of the requested styles; one marked recovery or failure does not count."
         raise Conflict(why, add)
-    asked: RetrainingRequest = {
-        "surgeon": batch.surgeon,
-        "suture": batch.suture,
-        "only_stale": batch.only_stale,
-        "learner": describe_learner(learner),
-        "learner_version": LEARNER_VERSION,
-        "gate": GATE_VERSION,
-        "poses": POSES_VERSION,
-        "near": asdict(near or NearLimits()),
-        "odds": asdict(odds or OddsLimits()),
-        "joins": JOIN_AS_SERVED if batch.chosen is None else None,
-        "seed": 0,
-        "release": batch.release,
-    }
-    served = settings_of_served(session, None if who is None else [who.row])
-    stale = _reasons(session, demos, asked, served, who, what)
-    chosen = [demo for demo in demos if stale[demo.row] or not batch.only_stale]
-    request, unsettled = _unsettled(session, asked, chosen, served)
-    return request, [{"demonstration_row": demo.row, "stale": stale[demo.row]} for demo in unsettled]
+    asked = RetrainingRequest(
+        surgeon=batch.surgeon,
+        suture=batch.suture,
+        only_stale=batch.only_stale,
+        learner=learner,
+        near=near or NearLimits(),
+        odds=odds or OddsLimits(),
+        joins=JOIN_AS_SERVED if batch.chosen is None else None,
+        release=batch.release,
+    )
+    served = requests_of_served(session, None if who is None else [who.row])
+    trainings = {demo.row: _training_of(session, demo, asked, served.get(demo.style)) for demo in demos}
+    stale = _reasons(session, demos, trainings, asked, _styles(PolicyVersion, who, what))
+    chosen = [demo.row for demo in demos if stale[demo.row] or not batch.only_stale]
+    request, unsettled = _unsettled(session, asked, chosen, trainings)
+    return request, [{"demonstration_row": row, "stale": stale[row]} for row in unsettled]
+
+
+def _training_of(
+    session: Session, demo: "_Newest", asked: RetrainingRequest, served: TrainingRequest | None
+) -> TrainingRequest:
+    """Return the training of a style: of its newest demonstration, or of as many as its served policy combines."""
+    demos = [demo.sha256]
+    if served is not None and served.combine is not None:
+        newest = newest_demos(session, demo.surgeon_row, demo.suture, len(served.demos))
+        demos = [one.sha256 for one in newest]
+    return asked.training_of((demo.surgeon, demo.suture), demos, served)
 
 
 def _unsettled(
-    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], served: dict[Style, ServedSettings]
-) -> tuple[RetrainingRequest, Sequence["_Newest"]]:
-    """Return the request to make, and its styles; if an equal batch is done, only the styles that it would now release.
+    session: Session, asked: RetrainingRequest, chosen: Sequence[int], trainings: dict[int, TrainingRequest]
+) -> tuple[RetrainingRequest, Sequence[int]]:
+    """Return the request to make, and the demonstrations of its styles.
 
-    `after` names that batch, so that the request differs from it, while a repetition of the request does not differ.
+    If an equal batch is done, these are only the styles that it would now release. `after` names that batch, so that
+    the request differs from it, while a repetition of the request does not differ.
     """
     while True:
-        digest = sha256(canonical([_made_of(session, demo, served.get(demo.style), asked) for demo in chosen]))
-        request: RetrainingRequest = {**asked, "styles": len(chosen), "demos_sha256": digest}
-        known = jobs.find_live(session, BATCH, request)
-        if known is None or known.state != "succeeded" or not asked["release"]:
+        digest = sha256(canonical([trainings[row].stored for row in chosen]))
+        request = asked.model_copy(update={"styles": len(chosen), "demos_sha256": digest})
+        known = jobs.find_live(session, request)
+        if known is None or known.state != "succeeded" or not asked.release:
             return request, chosen
         left = jobs.changed_since(session, known.row)
         if not left:
             return request, chosen
-        chosen = [demo for demo in chosen if demo.row in left]
-        asked = {**asked, "after": known.id}
-
-
-def _made_of(session: Session, demo: "_Newest", served: ServedSettings | None, asked: RetrainingRequest) -> list[Any]:
-    """Return the combination of a style, the digests of its newest demonstrations, its rule and its scene."""
-    if served is None:
-        return [None, [demo.sha256], None, None]
-    kind, demos = None, [demo.sha256]
-    if served.combining is not None:
-        kind, newest = served.combining.kind, newest_demos(session, demo.surgeon_row, demo.suture, served.demos)
-        demos = [one.sha256 for one in newest]
-    rule = served.join_share if asked["joins"] == JOIN_AS_SERVED else None
-    return [kind, demos, rule, None if served.surroundings is None else served.surroundings.as_json()]
+        chosen = [row for row in chosen if row in left]
+        asked = asked.model_copy(update={"after": known.id})
 
 
 def _did_nothing(session: Session, job: Job) -> str:
@@ -201,6 +195,7 @@ class _Newest:
     row: int
     sha256: str
     surgeon_row: int
+    surgeon: str
     suture: str
 
     @property
@@ -213,8 +208,8 @@ def _newest_demos(session: Session, surgeon: Surgeon | None, suture: SutureType 
     of = Demonstration
     newest = select(func.max(of.row)).where(of.learnable, *_styles(of, surgeon, suture))
     newest = newest.group_by(of.surgeon_row, of.suture)
-    query = select(of.row, of.sha256, of.surgeon_row, of.suture).where(of.row.in_(newest)).order_by(of.row)
-    return [_Newest(*row) for row in session.execute(query)]
+    query = select(of.row, of.sha256, of.surgeon_row, Surgeon.slug, of.suture).join(Surgeon)
+    return [_Newest(*row) for row in session.execute(query.where(of.row.in_(newest)).order_by(of.row))]
 
 
 def _styles(
@@ -228,19 +223,18 @@ def _styles(
 def _reasons(
     session: Session,
     demos: Sequence[_Newest],
+    trainings: dict[int, TrainingRequest],
     asked: RetrainingRequest,
-    served: dict[Style, ServedSettings],
-    surgeon: Surgeon | None,
-    suture: SutureType | None,
+    styles: list[ColumnElement[bool]],
 ) -> dict[int, list[str]]:
     """Return, by demonstration, why its style's newest version is stale; an empty list if it is up to date.
 
-    It is up to date if it was learnt from this demonstration with these settings and this learner, in the scene of the
-    served version, not refused by an older gate, and checked with the same limits at the near starts.
+    It is up to date if it was learnt from this demonstration with the settings of the training that would be made, in
+    the same scene, not refused by an older gate, and checked with the same limits.
     """
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
-    newest = last.where(*_styles(of, surgeon, suture)).subquery()
+    newest = last.where(*styles).subquery()
     query = select(of.surgeon_row, of.suture, of.releasable, cast(of.manifest, Text)).join(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
@@ -251,18 +245,15 @@ def _reasons(
         demo = of_style.get((who, what))
         if demo is None:
             continue
-        manifest, kept = PolicyManifest.model_validate_json(text), served.get((who, what))
-        certificate, near = manifest.grid_certificate, NearLimits(**asked["near"])
-        learner = learner_of(learner_for(asked, kept))
-        odds = None if manifest.scene is None else manifest.scene.near
+        manifest = PolicyManifest.model_validate_json(text)
+        made, wanted = request_of(manifest), trainings[demo.row]
         found = {
-            "a newer demonstration": demo.sha256 not in manifest.demos,
-            "another scene": manifest.surroundings != (None if kept is None else kept.surroundings),
-            "other settings": (manifest.learnt_with, manifest.seed) != (learner, asked["seed"]),
-            "a newer learner": manifest.learner_version != asked["learner_version"],
-            "refused by an older gate": not releasable and certificate.gate != asked["gate"],
-            "other limits at the near starts": limits_of(NearLimits, certificate.near) != near
-            or (odds is not None and limits_of(OddsLimits, odds) != OddsLimits(**asked["odds"])),
+            "a newer demonstration": demo.sha256 not in made.demos,
+            "another scene": made.surroundings != wanted.surroundings,
+            "other settings": (made.learner, made.seed) != (wanted.learner, wanted.seed),
+            "a newer learner": manifest.learner_version != wanted.learner_version,
+            "refused by an older gate": not releasable and manifest.grid_certificate.gate != wanted.gate,
+            "other limits at the near starts": made.near != wanted.near or made.odds not in (None, asked.odds),
         }
         reasons[demo.row] = [reason for reason, holds in found.items() if holds]
     return reasons
@@ -273,27 +264,26 @@ def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]], size: 
     demos = [style["demonstration_row"] for style in styles]
     there = set(session.scalars(select(Demonstration.row).where(Demonstration.row.in_(demos))))
     left = [style for style in styles if style["demonstration_row"] in there]
-    parts = [_new_part(job) for _ in range(0, len(left), size)]
+    parts = [
+        # without its request and identity, which name its row
+        Job(
+            id=(name := secrets.token_hex(8)),
+            kind=PART,
+            identity=sha256(name.encode()),
+            request={},
+            surgeon_row=job.surgeon_row,
+            requested_by=job.requested_by,
+        )
+        for _ in range(0, len(left), size)
+    ]
     session.add_all(parts)
     session.flush()
     rows = []
     for number, part in enumerate(parts):
-        request: PartRequest = {"retraining": job.row, "part": part.row}
-        part.request, part.identity = {**request}, jobs.identity_of(PART, request)
+        request = PartRequest(retraining=job.row, part=part.row)
+        part.request, part.identity = request.stored, request.identity
         rows += [{"job_row": job.row, "part_row": part.row, **style} for style in left[number * size :][:size]]
     session.execute(insert(StyleToRetrain), rows)
-
-
-def _new_part(job: Job) -> Job:
-    """Return a part of a batch without its request, which names the part's row."""
-    return Job(
-        id=(name := secrets.token_hex(8)),
-        kind=PART,
-        identity=jobs.identity_of(PART, {"retraining": job.id, "part": name}),
-        request={},
-        surgeon_row=job.surgeon_row,
-        requested_by=job.requested_by,
-    )
 
 
 def find_retraining(session: Session, job_id: str) -> Job:

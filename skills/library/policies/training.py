@@ -9,51 +9,35 @@ Learning and certifying run outside any transaction; the result is packed before
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict
-from typing import Any
 
 from sqlalchemy.orm import Session
 
-from skills.db.models import (
-    PolicyVersion,
-    Surgeon,
-)
+from skills.db.models import PolicyVersion, Surgeon
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.deep import require_installed
 from skills.errors import BadInput
 from skills.gridworld.hazards import refuse_unfit
 from skills.gridworld.reward import RewardLevels
-from skills.learning.certificate import (
-    NearLimits,
-    OddsLimits,
-)
+from skills.learning.certificate import NearLimits, OddsLimits
 from skills.learning.in_scene import scene_learner
-from skills.learning.policy import (
-    LEARNER_VERSION,
-    Learner,
-    describe_learner,
-    refuse_loops,
-    refuse_too_large,
-)
+from skills.learning.policy import Learner, refuse_loops, refuse_too_large
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.ties import rule_in
 from skills.library.operation import jobs
-from skills.library.operation.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
+from skills.library.operation.jobs import QUEUED, RequestedJob, Store, did_nothing
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
-from skills.library.policies.combined import BEST, choose_demos, combining_of
-from skills.library.policies.gate import GATE_VERSION
-from skills.library.policies.learning import ANY, combined_lesson, learn_style, lessons, store_style, with_partners
+from skills.library.policies.combined import BEST, choose_demos
+from skills.library.policies.learning import combined_lesson, learn_style, lessons, store_style, with_partners
+from skills.library.policies.requests import ANY, TrainingRequest
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import find_demo
 from skills.library.recordings.recordings import confined_reader
 from skills.schemas.training import TrainingIn, TrainingResult
 from skills.settings import Settings
-
-POSES_VERSION = 1  # part of a training's identity: raise it when equal demonstrations give another pose style
 
 
 def request_training(
@@ -88,7 +72,7 @@ def request_training(
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
     request, who = training_request(session, training, near, odds)
-    job, new = jobs.ask(session, "training", request, who, actor)
+    job, new = jobs.ask(session, request, who, actor)
     if new:
         return RequestedJob(job, True, QUEUED)
     again = training.release and job.state == "succeeded"
@@ -106,37 +90,33 @@ def training_request(
     chosen = choose_demos(session, who, what.slug, training.demos, any_outcome=any_outcome)
     # Before the job is queued, so that the caller sees the error at once.
     refuse_too_large(chosen[-1].path, learner, in_scene=training.scene is not None)
-    request: TrainingRequest = {
-        "surgeon": who.slug,
-        "suture": what.slug,
-        "demos": [demo.sha256 for demo in chosen],
-        "learner": describe_learner(learner),
-        "learner_version": LEARNER_VERSION,
-        "gate": GATE_VERSION,
-        "poses": POSES_VERSION,
-        "near": asdict(near or NearLimits()),
-        "seed": training.seed,
-        "release": training.release,
-    }
-    if len(chosen) > 1:
-        request["combine"] = {"kind": (training.combining or BEST).kind}
-    elif training.combining is not None:
+    combine = training.combine or (BEST if len(chosen) > 1 else None)
+    if combine is not None and len(chosen) == 1:
         raise BadInput("A single demonstration is not combined; name several in `demos`, or omit `combine`.")
-    if any_outcome:
-        request["outcomes"] = ANY
     if training.depth_along is not None:
         _refuse_depth_along(training.depth_along, learner, chosen[-1].frame)
-        request["depth_along"] = list(training.depth_along)
     if (surroundings := training.surroundings) is not None:
         scene_learner(learner)
         if training.depth_along is not None:
             raise BadInput("In a scene depths are not compared, but have a cost; omit `depth_along`.")
         for demo in chosen:
             refuse_unfit(surroundings.scene, demo.path, demo.frame)
-        request["surroundings"] = surroundings.as_json()
-        request["odds"] = asdict(odds or OddsLimits())
     elif training.scene_costs is not None:
         raise BadInput("scene_costs are costs of a scene; give the scene too, or omit them.")
+    request = TrainingRequest(
+        surgeon=who.slug,
+        suture=what.slug,
+        demos=[demo.sha256 for demo in chosen],
+        learner=learner,
+        near=near or NearLimits(),
+        odds=None if surroundings is None else odds or OddsLimits(),
+        seed=training.seed,
+        release=training.release,
+        combine=combine,
+        outcomes=ANY if any_outcome else None,
+        depth_along=training.depth_along,
+        surroundings=surroundings,
+    )
     return request, who
 
 
@@ -190,22 +170,21 @@ def _release_again(session: Session, job: Job, actor: str) -> str:
 def train_style(database: Database, request: TrainingRequest, settings: Settings) -> Store:
     """Learn, certify and measure the requested style; the returned function stores the result."""
     with database.reading() as session:
-        found = lessons(session, [find_demo(session, one).row for one in request["demos"]])
+        found = lessons(session, [find_demo(session, one).row for one in request.demos])
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if a recording is not cached
         found = with_partners(database, found, reader.parse)
-    lesson = combined_lesson(found, combining_of(request["combine"]["kind"])) if "combine" in request else found[0]
-    learnt = learn_style(lesson, request, settings, jobs.progress_callback(database, "training", request))
+    lesson = combined_lesson(found, request.combine)
+    learnt = learn_style(lesson, request, settings, jobs.progress_callback(database, request))
 
-    def store(session: Session, actor: str) -> dict[str, Any]:
+    def store(session: Session, actor: str) -> TrainingResult:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)
-        wanted = request["release"]
-        released = releases.try_release(session, version, actor) if wanted else releases.NOT_REQUESTED
+        released = releases.try_release(session, version, actor) if request.release else releases.NOT_REQUESTED
         return TrainingResult(
             policy_version=version.version,
             sha256=version.sha256,
             releasable=version.releasable,
             **released._asdict(),
-        ).model_dump()
+        )
 
     return store
