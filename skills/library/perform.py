@@ -25,7 +25,7 @@ from skills.settings import Settings
 
 __all__ = ["perform_job"]
 
-PERFORMERS: dict[type[JobRequest], Callable[[Database, Any, Settings], Store]] = {
+PERFORMERS: dict[type[JobRequest], Callable[[Database, Any, Settings], Store[Any]]] = {
     TrainingRequest: train_style,
     PartRequest: retrain_part,
     PlaybackRequest: check_playback,

@@ -7,7 +7,7 @@ the plan. A figure is null if it could not be measured; a gate with such a figur
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictBool, StrictInt
+from pydantic import Field, StrictInt
 
 from skills.fields import Count, Point, Quaternion, Sha256, Slug
 from skills.gridworld.scene import Scene
@@ -134,9 +134,6 @@ class PlanIn(Schema):
         description="Height of level tissue, along z of the arm's frame: it is that of the scene. No motion is "
         "exported without tissue, of this, of the scene, or of the policy's.",
     )
-    realignment: StrictBool = Field(
-        default=True, description="false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now."
-    )
     handoff: Literal["none"] | None = Field(
         default=None,
         description="none asks for a plan that hands nothing over: A1 alone. Without it a plan is refused for which "
@@ -224,7 +221,6 @@ class PlanDescription(Given):
     )
     path: str = Field(description="fitted, or cell centres.")
     psm_m: PsmM | None
-    realignment: bool
     scene: PlanScene | None = Field(
         description="Tissue and obstacles; null: none was stated, and nothing is compared with them."
     )
@@ -248,7 +244,7 @@ class Plan(PlanDescription):
     suture: Slug
     policy: PolicyName
     hands_over: bool = Field(description="Whether a hand-off is planned: A2 towards PSM_M.")
-    in_words: str = Field(description="What the plan does and what it leaves out.")
+    description: str = Field(description="What the plan does and what it leaves out.")
     created_at: datetime
 
 

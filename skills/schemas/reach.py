@@ -82,4 +82,4 @@ class Reach(Given):
     counts: tuple[Count, Count, Count] = Field(description="Number of places along x, y and z.")
     rotations: Count
     places: list[ReachPlace]
-    in_words: str
+    description: str

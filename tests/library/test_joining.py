@@ -15,9 +15,9 @@ from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library.operation.integrity import covered, learnt
 from skills.library.policies import releases
-from skills.library.policies.gate import refusals
+from skills.library.policies.gate import GateLimits, refusals
 from skills.library.policies.retraining import request_retraining
-from skills.library.policies.training import near_limits, request_training
+from skills.library.policies.training import request_training
 from skills.schemas.training import RetrainingIn, TrainingIn
 from skills.settings import Settings
 from tests.library import cases
@@ -66,8 +66,8 @@ def test_the_gates_limit_is_a_setting_and_part_of_a_trainings_identity(database)
     refused = cases.train(database)
     with database.writing() as session:
         asked = TrainingIn(surgeon="kestrel", suture=cases.SUTURE)
-        job = request_training(session, asked, "test", NearLimits(3.0, 0.0)).job
-        same = request_training(session, asked, "test", near_limits(Settings())).job
+        job = request_training(session, asked, "test", GateLimits(NearLimits(3.0, 0.0))).job
+        same = request_training(session, asked, "test", GateLimits.of(Settings())).job
     assert job.row != same.row, "an equal training under another limit is another job"
     result = cases.work(database, job).result
     assert (result["policy_version"], result["releasable"]) == (refused.version + 1, True)
@@ -79,12 +79,12 @@ def test_a_batch_of_stale_styles_takes_those_checked_by_other_near_limits(databa
     cases.train(database)
     asked = RetrainingIn(surgeon="kestrel", only_stale=True)
     for near, stale in ((NearLimits(), []), (NearLimits(3.0, 0.0), [["other limits at the near starts"]])):
-        job = request_retraining(database, asked, "test", near)[0]
+        job = request_retraining(database, asked, "test", GateLimits(near))[0]
         assert [style.stale for style in styles_of(database, job)] == stale
 
 
 def test_the_default_of_the_settings_is_that_of_the_gate():
-    assert near_limits(Settings()) == NearLimits()
+    assert GateLimits.of(Settings()).near == NearLimits()
 
 
 def test_a_manifest_states_shares_and_by_another_rule_a_table(database):

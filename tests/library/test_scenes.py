@@ -27,7 +27,6 @@ from skills.library.policies import gate, releases
 from skills.library.policies.answers import roll_out
 from skills.library.policies.gate import refusals
 from skills.library.policies.retraining import request_retraining
-from skills.library.policies.training import odds_limits
 from skills.schemas.training import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
@@ -128,7 +127,7 @@ def test_a_policy_that_slips_too_often_is_stored_and_not_released(database):
 
 
 def test_the_default_of_the_settings_is_that_of_the_gate_in_a_scene():
-    assert odds_limits(Settings()) == OddsLimits()
+    assert gate.GateLimits.of(Settings()).odds == OddsLimits()
     with pytest.raises(BadSettings, match="must be in"):
         OddsLimits(least_finishing=nan)
 
@@ -173,7 +172,9 @@ def test_a_batch_keeps_the_scene_of_a_style_and_its_learner(database):
     with_demo(database)
     version = trained(database, release=True)
     assert [style.stale for style in styles_of(database, ask_retraining(database, only_stale=True))] == []
-    other = request_retraining(database, RetrainingIn(only_stale=True), "test", odds=OddsLimits(0.5, 0.5)).job
+    other = request_retraining(
+        database, RetrainingIn(only_stale=True), "test", gate.GateLimits(odds=OddsLimits(0.5, 0.5))
+    ).job
     assert [style.stale for style in styles_of(database, other)] == [["other limits at the near starts"]]
     job = ask_retraining(database)
     for part in parts_of(database, job):

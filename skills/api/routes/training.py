@@ -14,9 +14,10 @@ from skills.api.responses import (
 from skills.api.strict_json import Strict
 from skills.library.operation import locks
 from skills.library.operation.jobs import PART, attempts_to_submit, count
+from skills.library.policies.gate import GateLimits
 from skills.library.policies.outcomes import describe_job, describe_styles
 from skills.library.policies.retraining import find_retraining, list_styles, request_retraining
-from skills.library.policies.training import near_limits, odds_limits, request_training
+from skills.library.policies.training import request_training
 from skills.schemas.training import Retraining, RetrainingIn, TrainingIn
 from skills.settings import MEBIBYTE
 
@@ -32,7 +33,7 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, se
     """
     refuse_release(caller, body.release)
     with db.writing([locks.surgeon(body.surgeon)]) as session:
-        job, new, did = request_training(session, body, actor, near_limits(settings), odds_limits(settings))
+        job, new, did = request_training(session, body, actor, GateLimits.of(settings))
         answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
@@ -48,7 +49,7 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
     ended; the new job covers only these. `did` states the effect of the request.
     """
     refuse_release(caller, body.release)
-    job, new, did = request_retraining(db, body, actor, near_limits(settings), odds_limits(settings))
+    job, new, did = request_retraining(db, body, actor, GateLimits.of(settings))
     with db.reading() as session:
         told = attempts_to_submit(session, job) if new else []
         answer = accepted(session, job, did)

@@ -14,7 +14,7 @@ even if several workers train it. The batch ends in the same transaction as its 
 
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
@@ -37,7 +37,8 @@ from skills.schemas.training import StoredComparison
 TRAINING, BATCH, PART = "training", "retraining", "retraining-part"
 EXPORT, PICTURES = "dataset", "pictures"
 ACTIVE = ("queued", "running")
-Store = Callable[[Session, str], JobResult]  # stores a result in a transaction, on behalf of this actor
+Result = TypeVar("Result", bound=JobResult)
+Store = Callable[[Session, str], Result]  # stores a result in a transaction, on behalf of this actor
 # For statements that change many rows: no object of the session has to follow, so none is searched for.
 UNSYNCHRONISED: Any = {"execution_options": {"synchronize_session": False}}
 Rows = Sequence[int] | Select[int]  # at most as many as a statement may have parameters, or a query

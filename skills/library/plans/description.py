@@ -24,7 +24,6 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory, learnt_in: Scene | N
         a2=plan.a2 if plan.psm_m is not None else None,
         path=plan.path,
         psm_m=None if plan.psm_m is None else _describe_psm_m(plan.psm_m),
-        realignment=plan.psm_m is not None,
         scene=None if plan.scene is None else _describe_scene(plan.scene, learnt_in),
         speed_mm_s=plan.speed_mm_s,
         tip_offset_mm=plan.tip_offset_mm,
@@ -124,7 +123,7 @@ def describe_stored(row: Plan) -> schemas.Plan:
         suture=row.policy.suture,
         policy=PolicyName.model_validate(row.policy),
         hands_over=row.about.psm_m is not None,
-        in_words=describe_motion(row.about),
+        description=describe_motion(row.about),
         created_at=row.created_at,
     )
 

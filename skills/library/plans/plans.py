@@ -211,7 +211,7 @@ def _takes_the_needle(request: PlanIn, partner: Partner | None) -> PsmM | None:
         raise BadPlan(
             "handoff is 'none', but the request has psm_m, the arm that takes the needle.", "Omit one of them."
         )
-    if request.handoff == "none" or not request.realignment:
+    if request.handoff == "none":
         return None
     if request.psm_m is None and partner is None:
         raise NoHandOff(

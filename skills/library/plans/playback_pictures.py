@@ -32,7 +32,7 @@ def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> 
     return jobs.ask(session, _wanted(playback), playback.plan.policy.surgeon, actor)
 
 
-def draw_pictures(database: Database, request: PicturesRequest, settings: Settings) -> Store:
+def draw_pictures(database: Database, request: PicturesRequest, settings: Settings) -> Store[PicturesResult]:
     """Draw the film and plots of a playback; the returned function stores them."""
     from skills.simulation import film, pictures
 

@@ -6,7 +6,6 @@ A plan may be played even if its policy was withdrawn since: a verdict moves no 
 current state of the policy's release, and it is the replay bag that is refused for a policy that is not released.
 """
 
-from collections.abc import Callable
 from typing import ClassVar, Literal
 
 from sqlalchemy import select
@@ -18,7 +17,7 @@ from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest, learnt, planned
-from skills.library.operation.jobs import JobRequest
+from skills.library.operation.jobs import JobRequest, Store
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.plans.headline import CHECK_VERSION, headline
 from skills.library.plans.plans import check_frame, find_plan, hand_of, trajectory_of
@@ -77,9 +76,7 @@ def playback_request(plan_sha256: str, settings: Settings, errors: ArmErrors | N
     )
 
 
-def check_playback(
-    database: Database, request: PlaybackRequest, settings: Settings
-) -> Callable[[Session, str], PlaybackResult]:
+def check_playback(database: Database, request: PlaybackRequest, settings: Settings) -> Store[PlaybackResult]:
     """Play a plan in the simulator, judge it, and estimate its probability of success by Monte Carlo.
 
     The returned function stores all of it.

@@ -127,7 +127,7 @@ def _plan(row: Plan, about: PlanDescription) -> dict[str, Any]:
         "suture": policy.suture,
         "policy": {"version": policy.version, "sha256": policy.sha256},
         **about.model_dump(mode="json"),
-        "in_words": describe_motion(about),
+        "description": describe_motion(about),
     }
 
 

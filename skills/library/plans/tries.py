@@ -45,10 +45,10 @@ from skills.library.plans.playbacks import (
     playback_request,
 )
 from skills.library.policies import releases
-from skills.library.policies.gate import join_reasons, remedy
-from skills.library.policies.learning import learn_style, lessons, store_style, with_partners
-from skills.library.policies.training import near_limits, odds_limits, training_request
-from skills.library.recordings.demos import add_demo, find_demo
+from skills.library.policies.gate import GateLimits, join_reasons, remedy
+from skills.library.policies.training import train_style, training_request
+from skills.library.policies.versions import find_by_digest
+from skills.library.recordings.demos import add_demo
 from skills.library.recordings.parts import choose_part
 from skills.library.recordings.recordings import Parser, confined_reader, find_recording, stored_recording
 from skills.remedies import Remedy
@@ -94,7 +94,7 @@ def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
     return RequestedJob(job, new, jobs.QUEUED if new else jobs.did_nothing(job))
 
 
-def perform_try(database: Database, request: TryRequest, settings: Settings) -> Store:
+def perform_try(database: Database, request: TryRequest, settings: Settings) -> Store[TryResult]:
     """Carry out a try, and write each of its steps into the running job's result.
 
     Raises:
@@ -139,15 +139,15 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
     others: list[Choice] = []
     try:
         told = stored_recording(database, asked.recording, read)
-        yield _done("read", _read_in_words(told))
+        yield _done("read", _describe_recording(told))
         at = "propose"
         others = _other_parts(told.proposed, asked.segment)
         if asked.segment is None and len(told.proposed) > 1:
-            yield TryStep(name="propose", state="asks", text=_proposed_in_words(told.proposed), choices=tuple(others))
+            yield TryStep(name="propose", state="asks", text=_describe_proposed(told.proposed), choices=tuple(others))
             return
         cut = DemoIn(surgeon=asked.surgeon, suture=asked.suture, segment=asked.segment)
         part, which, because = choose_part(told, cut)
-        yield _done("propose", f"{_proposed_in_words(told.proposed)} Taken: {which}; {because}.")
+        yield _done("propose", f"{_describe_proposed(told.proposed)} Taken: {which}; {because}.")
         at = "cut"
         demo = cut_demo(told.recording, arm=part.arm, topic=part.topic, start_s=part.start_s, end_s=part.end_s)
         chosen, measured = choose_cells(demo, asked)
@@ -157,7 +157,7 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         yield _done("cut", chosen.because, added.sha256)
         yield _done("report", " ".join(added.report.advice) or "Nothing to improve in the recording.")
         at = "train"
-        version, trained = _learn(database, asked, added.sha256, settings, read)
+        version, trained = _learn(database, asked, added.sha256, actor, settings)
         yield trained
         at = "certify"
         certified = _certified(version, others)
@@ -277,7 +277,7 @@ def _refused(name: StepName, refused: SkillsError, others: Sequence[Choice]) -> 
     return TryStep(name=name, state="refused", text=refused.message, choices=tuple(others), remedies=remedies)
 
 
-def _read_in_words(parsed: ParsedContent) -> str:
+def _describe_recording(parsed: ParsedContent) -> str:
     about = parsed.about
     motions = "; ".join(
         f"{one.arm} in {one.frame}, {one.samples} samples at {quality.rate_hz:.0f} Hz"
@@ -286,7 +286,7 @@ def _read_in_words(parsed: ParsedContent) -> str:
     return f"A recording of {about.duration_s:.1f} s ({parsed.recording.format}): {motions}."
 
 
-def _proposed_in_words(proposed: Sequence[Segment]) -> str:
+def _describe_proposed(proposed: Sequence[Segment]) -> str:
     if not proposed:
         return "No hand-off is proposed."
     return "1 hand-off is proposed." if len(proposed) == 1 else f"{len(proposed)} hand-offs are proposed."
@@ -320,24 +320,22 @@ def _change(cells: Cells) -> dict[str, Any]:
 
 
 def _learn(
-    database: Database, asked: TryIn, demo: str, settings: Settings, read: Parser
+    database: Database, asked: TryIn, demo: str, actor: str, settings: Settings
 ) -> tuple[PolicyVersion, TryStep]:
     """Learn and certify a style from a demonstration and store it; return its version, and the step."""
+    training = TrainingIn(surgeon=asked.surgeon, suture=asked.suture, demos=[demo])
     with database.reading() as session:
-        training = TrainingIn(surgeon=asked.surgeon, suture=asked.suture, demos=[demo])
-        request, _ = training_request(session, training, near_limits(settings), odds_limits(settings))
-        found = lessons(session, [find_demo(session, demo).row])
-    (lesson,) = with_partners(database, found, read)
-    made = learn_style(lesson, request, settings)
+        request, _ = training_request(session, training, GateLimits.of(settings))
+    store = train_style(database, request, settings)
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
-        version = session.get_one(PolicyVersion, store_style(session, made).row)
+        version = find_by_digest(session, store(session, actor).sha256)
         assert version.surgeon.slug == asked.surgeon  # loaded here, for the time after the session
-    metrics = made.manifest.metrics
+    metrics = version.manifest.metrics
     text = (
-        f"Version {version.version} by {made.manifest.learner}: it reproduces {metrics.exact_states} of "
+        f"Version {version.version} by {version.manifest.learner}: it reproduces {metrics.exact_states} of "
         f"{metrics.path_states} states of the demonstration, DTW {metrics.dtw_total_mm:g} mm."
     )
-    return version, _done("train", text, made.sha256)
+    return version, _done("train", text, version.sha256)
 
 
 def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:

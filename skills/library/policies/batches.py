@@ -85,7 +85,7 @@ class _Batch:
     parse: Parser
 
 
-def retrain_part(database: Database, request: PartRequest, settings: Settings) -> Store:
+def retrain_part(database: Database, request: PartRequest, settings: Settings) -> Store[JobResult]:
     """Train the styles of a part that are still queued.
 
     A style that is refused has failed; a style at which the service itself fails stays queued for the next attempt at

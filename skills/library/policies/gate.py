@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan
@@ -19,6 +19,7 @@ from skills.learning.dynamic_programming import FAINT
 from skills.learning.policy import Policy
 from skills.planning.plan import DrivenPass, driven_pass
 from skills.schemas.policies import GateRefusal, RefusalKind
+from skills.settings import Settings
 
 GATE_VERSION = 1  # part of a training's identity: raise it when the gate's result for an equal policy changes
 
@@ -38,6 +39,24 @@ _REMEDIES: dict[RefusalKind, str] = {
     "joint limits": "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere.",
     "jaw held": "Train it again, and request its release.",
 }
+
+
+class GateLimits(NamedTuple):
+    """The gate's limits: at the starts near the demonstrated one, and in a scene."""
+
+    near: NearLimits = NearLimits()
+    odds: OddsLimits = OddsLimits()
+
+    @classmethod
+    def of(cls, settings: Settings) -> "GateLimits":
+        """Return those that an installation sets."""
+        return cls(
+            NearLimits(settings.near_radius_mm, settings.near_least_share),
+            OddsLimits(settings.scene_least_finishing, settings.scene_most_touching),
+        )
+
+
+DEFAULT_LIMITS = GateLimits()
 
 
 def limits_of(kind: type[T], judged: T) -> T:

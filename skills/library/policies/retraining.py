@@ -16,12 +16,12 @@ from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
-from skills.learning.certificate import NearLimits, OddsLimits
 from skills.library.operation import jobs, locks
 from skills.library.operation.jobs import BATCH, PART, PartRequest, RequestedJob, did_nothing
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
+from skills.library.policies.gate import DEFAULT_LIMITS, GateLimits
 from skills.library.policies.releases import Style
 from skills.library.policies.requests import (
     JOIN_AS_SERVED,
@@ -44,11 +44,7 @@ FEWEST_PARTS = 16  # if there are so many styles: workers share a batch part by 
 
 
 def request_retraining(
-    database: Database,
-    batch: RetrainingIn,
-    actor: str,
-    near: NearLimits | None = None,
-    odds: OddsLimits | None = None,
+    database: Database, batch: RetrainingIn, actor: str, limits: GateLimits = DEFAULT_LIMITS
 ) -> RequestedJob:
     """Queue a batch that trains styles again, each from its newest demonstration that may be learnt from.
 
@@ -75,8 +71,7 @@ def request_retraining(
         batch: The request. Without `surgeon` or `suture` styles of all of them are trained, and without `learner` phase
             Q-learning with its defaults learns.
         actor: The owner of the caller's key.
-        near: The gate's limit at the starts near the demonstrated one; None for its defaults.
-        odds: The gate's limits in a scene; None for their defaults.
+        limits: The gate's limits.
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
@@ -86,7 +81,7 @@ def request_retraining(
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
     with database.reading() as session:
-        request, styles = choose_styles(session, batch, near, odds)
+        request, styles = choose_styles(session, batch, limits)
     names = [] if batch.surgeon is None else [locks.surgeon(batch.surgeon)]
     with database.writing([locks.BATCHES, *names]) as session:
         who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
@@ -115,7 +110,7 @@ def request_retraining(
 
 
 def choose_styles(
-    session: Session, batch: RetrainingIn, near: NearLimits | None = None, odds: OddsLimits | None = None
+    session: Session, batch: RetrainingIn, limits: GateLimits = DEFAULT_LIMITS
 ) -> tuple[RetrainingRequest, list[dict[str, Any]]]:
     """Return the request of a batch's job, and for each of its styles the demonstration and why it is stale.
 
@@ -136,8 +131,8 @@ def choose_styles(
         suture=batch.suture,
         only_stale=batch.only_stale,
         learner=learner,
-        near=near or NearLimits(),
-        odds=odds or OddsLimits(),
+        near=limits.near,
+        odds=limits.odds,
         joins=JOIN_AS_SERVED if batch.chosen is None else None,
         release=batch.release,
     )

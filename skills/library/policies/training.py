@@ -19,7 +19,6 @@ from skills.deep import require_installed
 from skills.errors import BadInput
 from skills.gridworld.hazards import refuse_unfit
 from skills.gridworld.reward import RewardLevels
-from skills.learning.certificate import NearLimits, OddsLimits
 from skills.learning.in_scene import scene_learner
 from skills.learning.policy import Learner, refuse_loops, refuse_too_large
 from skills.learning.q_learning import PhaseQLearning
@@ -31,6 +30,7 @@ from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
 from skills.library.policies.combined import BEST, choose_demos
+from skills.library.policies.gate import DEFAULT_LIMITS, GateLimits
 from skills.library.policies.learning import combined_lesson, learn_style, lessons, store_style, with_partners
 from skills.library.policies.requests import ANY, TrainingRequest
 from skills.library.policies.versions import find_by_digest
@@ -41,11 +41,7 @@ from skills.settings import Settings
 
 
 def request_training(
-    session: Session,
-    training: TrainingIn,
-    actor: str,
-    near: NearLimits | None = None,
-    odds: OddsLimits | None = None,
+    session: Session, training: TrainingIn, actor: str, limits: GateLimits = DEFAULT_LIMITS
 ) -> RequestedJob:
     """Queue the training of a style, with all defaults resolved.
 
@@ -58,8 +54,7 @@ def request_training(
         training: The request. Without `demos` the newest demonstration of the style is meant that may be learnt from,
             without `combine` `BEST`, and without `learner` phase Q-learning with its defaults.
         actor: The owner of the caller's key.
-        near: The gate's limit at the starts near the demonstrated one; None for its defaults.
-        odds: The gate's limits in a scene; None for their defaults.
+        limits: The gate's limits.
 
     Raises:
         NotFound: The surgeon, the suture type or a demonstration is unknown.
@@ -71,7 +66,7 @@ def request_training(
             scene is in another frame or is touched by the demonstration, or the learner does not learn in a scene.
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
-    request, who = training_request(session, training, near, odds)
+    request, who = training_request(session, training, limits)
     job, new = jobs.ask(session, request, who, actor)
     if new:
         return RequestedJob(job, True, QUEUED)
@@ -79,9 +74,7 @@ def request_training(
     return RequestedJob(job, False, _release_again(session, job, actor) if again else did_nothing(job))
 
 
-def training_request(
-    session: Session, training: TrainingIn, near: NearLimits | None = None, odds: OddsLimits | None = None
-) -> tuple[TrainingRequest, Surgeon]:
+def training_request(session: Session, training: TrainingIn, limits: GateLimits) -> tuple[TrainingRequest, Surgeon]:
     """Return the request of a training's job with all defaults resolved, and the surgeon; see `request_training`."""
     learner = learner_to_train(training.chosen)
     who, what = find_surgeon(session, training.surgeon), find_suture_type(session, training.suture)
@@ -108,8 +101,8 @@ def training_request(
         suture=what.slug,
         demos=[demo.sha256 for demo in chosen],
         learner=learner,
-        near=near or NearLimits(),
-        odds=None if surroundings is None else odds or OddsLimits(),
+        near=limits.near,
+        odds=None if surroundings is None else limits.odds,
         seed=training.seed,
         release=training.release,
         combine=combine,
@@ -131,16 +124,6 @@ def learner_to_train(chosen: Learner | None) -> Learner:
     refuse_loops(RewardLevels(), learner)  # those of every demonstration that is added
     require_installed(learner)
     return learner
-
-
-def near_limits(settings: Settings) -> NearLimits:
-    """Return the gate's limit at the starts near the demonstrated one, as an installation sets it."""
-    return NearLimits(settings.near_radius_mm, settings.near_least_share)
-
-
-def odds_limits(settings: Settings) -> OddsLimits:
-    """Return the gate's limits in a scene, as an installation sets them."""
-    return OddsLimits(settings.scene_least_finishing, settings.scene_most_touching)
 
 
 def _refuse_depth_along(depth_along: Sequence[float], learner: Learner, frame: str) -> None:
@@ -167,7 +150,7 @@ def _release_again(session: Session, job: Job, actor: str) -> str:
     return f"Version {version.version} was released." if because is None else f"Nothing: {because}"
 
 
-def train_style(database: Database, request: TrainingRequest, settings: Settings) -> Store:
+def train_style(database: Database, request: TrainingRequest, settings: Settings) -> Store[TrainingResult]:
     """Learn, certify and measure the requested style; the returned function stores the result."""
     with database.reading() as session:
         found = lessons(session, [find_demo(session, one).row for one in request.demos])

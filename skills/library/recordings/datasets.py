@@ -283,7 +283,7 @@ class _Written:
     frames: int
 
 
-def export_dataset(database: Database, request: DatasetRequest, settings: Settings) -> Store:
+def export_dataset(database: Database, request: DatasetRequest, settings: Settings) -> Store[DatasetResult]:
     """Write the zip of a dataset to a temporary file; the returned function stores it.
 
     Raises:
