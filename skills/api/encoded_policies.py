@@ -12,7 +12,6 @@ from skills.errors import UnknownFormat
 from skills.library.operation.proofs import sign_files
 from skills.library.policies import answers
 from skills.library.policies.pose_styles import describe_pose_style, has_poses, poses_of
-from skills.library.policies.versions import Served
 from skills.settings import MEBIBYTE
 from skills.transparency.notes import Note
 
@@ -70,15 +69,15 @@ class Encoded:
             self._kept.put(key, body)
         return body
 
-    def signature(self, served: Served, head: Note, history: History) -> Body:
+    def signature(self, release: Release, head: Note, history: History) -> Body:
         """Return the signature of the responses of a released policy, each as it is sent; they are encoded for it.
 
         Args:
-            served: The policy and its release.
+            release: The release.
             head: A checkpoint of the history that covers both.
             history: The history, with the key.
         """
-        policy, release = served.policy, served.release
+        policy = release.policy
         bodies = {
             "policy.json": self.policy(policy, release, JSON),
             "policy-version.json": self.policy(policy, None, JSON),

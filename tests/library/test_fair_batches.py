@@ -36,7 +36,7 @@ def compared(database: Database, **asked: Any) -> dict[str, Any]:
 
 def served(database: Database) -> PolicyVersion:
     with database.reading() as session:
-        return versions.policy_of(session, "kestrel", cases.SUTURE).policy
+        return versions.served_release(session, "kestrel", cases.SUTURE).policy
 
 
 def test_a_policy_of_three_demos_is_retrained_on_the_newest_three(database: Database):
@@ -175,7 +175,7 @@ def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(datab
     trained = cases.train(database, demos=three[:1], learner=cases.PUBLISHED)
     with database.writing() as session:
         version = versions.find_by_digest(session, trained.sha256)
-        found = compare_versions(session, versions.policy_of(session, "kestrel", cases.SUTURE).policy, version)
+        found = compare_versions(session, versions.served_release(session, "kestrel", cases.SUTURE).policy, version)
         assert found.demos == tuple(three)
         with pytest.raises(releases.Conflict) as refused:
             releases.release(session, version, "test")

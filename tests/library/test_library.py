@@ -29,7 +29,8 @@ from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies import releases
-from skills.library.policies.versions import policy_of
+from skills.library.policies.requests import TrainingRequest
+from skills.library.policies.versions import served_release
 from skills.library.recordings.demos import add_demo, find_demo, withdraw_demo
 from skills.library.recordings.recordings import recording_bytes, store_recording
 from skills.schemas.demos import DemoIn
@@ -169,14 +170,14 @@ def test_the_same_training_gives_the_same_digest_in_any_database(database: Datab
 
 def interrupted(monkeypatch: pytest.MonkeyPatch, meanwhile: Callable[[], None]) -> None:
     """Run a callback after the learning and before its result is stored."""
-    train = library.MAKERS["training"]
+    train = library.PERFORMERS[TrainingRequest]
 
     def make(*asked: Any) -> Any:
         store = train(*asked)
         meanwhile()
         return store
 
-    monkeypatch.setitem(library.MAKERS, "training", make)
+    monkeypatch.setitem(library.PERFORMERS, TrainingRequest, make)
 
 
 def test_a_job_cancelled_while_it_learns_leaves_no_policy(database: Database, monkeypatch: pytest.MonkeyPatch):
@@ -255,7 +256,7 @@ def test_what_was_released_is_what_was_learnt(database: Database):
     demo = cases.add_demo(database)
     version = cases.train(database, release=True)
     with database.reading() as session:
-        served = policy_of(session, "kestrel", cases.SUTURE)
+        served = served_release(session, "kestrel", cases.SUTURE)
         assert served.policy.sha256 == version.sha256
         assert learnt(served.policy).path.states.tolist() == find_demo(session, demo.sha256).path.states.tolist()
 
@@ -286,7 +287,7 @@ def test_what_value_iteration_finds_may_be_released(database: Database):
     with database.writing() as session:
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
     with database.reading() as session:
-        assert policy_of(session, "kestrel", cases.SUTURE).policy.row == version.row
+        assert served_release(session, "kestrel", cases.SUTURE).policy.row == version.row
 
 
 def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: Database):

@@ -24,6 +24,7 @@ from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
 from skills.library.policies.gate import remedy
 from skills.library.policies.releases import in_force, release
+from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256
@@ -286,14 +287,14 @@ def test_a_mark_made_while_a_style_is_learnt(
     database: Database, monkeypatch: pytest.MonkeyPatch, outcomes: str, made: int
 ):
     demo = add(database)
-    train = library.MAKERS["training"]
+    train = library.PERFORMERS[TrainingRequest]
 
     def make(*asked: object) -> object:
         store = train(*asked)
         mark(database, demo, "failure")
         return store
 
-    monkeypatch.setitem(library.MAKERS, "training", make)
+    monkeypatch.setitem(library.PERFORMERS, TrainingRequest, make)
     job = cases.work(database, cases.ask_training(database, release=True, outcomes=outcomes))
     assert job.state == ("succeeded" if made else "failed")
     if not made:

@@ -17,7 +17,7 @@ from skills.library.operation.jobs import cancel
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans import playbacks
 from skills.library.plans.plans import trajectory_of
-from skills.library.plans.playback_pictures import draw_pictures, find_pictures
+from skills.library.plans.playback_pictures import PicturesRequest, draw_pictures, find_pictures
 from skills.planning.trajectory import time_parametrise
 from skills.settings import Settings
 from skills.simulation import film, pictures
@@ -83,7 +83,7 @@ def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
     monkeypatch.setattr(film, "FRAMES_PER_PASS", 2)
     [job] = asked(database)
     assert job.id in refusal(database, playback)
-    store = draw_pictures(database, job.request, Settings(database_url=database.url))
+    store = draw_pictures(database, PicturesRequest.model_validate(job.request), Settings(database_url=database.url))
     for _ in range(2):  # the second time by a worker that does not know of the first
         with database.writing() as session:
             assert store(session, "test") == {"playback": playback.sha256}

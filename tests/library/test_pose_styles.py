@@ -20,6 +20,7 @@ from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import HISTORY, inspect_installation
+from skills.library.operation.jobs import PartRequest
 from skills.library.people.erasure import erase_demo
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies import learning, training
@@ -238,7 +239,7 @@ def test_a_batch_tries_a_style_again_whose_recording_cannot_be_read_now(
     with monkeypatch.context() as now:
         now.setattr(learning, "stored_recording", busy)
         with pytest.raises(Busy):
-            retrain_part(database, part.request, Settings(database_url=database.url))
+            retrain_part(database, PartRequest.model_validate(part.request), Settings(database_url=database.url))
     assert states_of(database, job) == ["queued"]
     cases.work(database, part)
     assert states_of(database, job) == ["done"]

@@ -152,13 +152,11 @@ def describe_playback(session: Session, row: StoredPlayback, settings: Settings)
     All of its pictures but the first are drawn after the verdict.
     """
     here, policy = f"/playbacks/{row.sha256}", row.plan.policy
-    return Playback(
+    return Playback.from_attributes_of(
+        row,
         id=row.sha256,
-        sha256=row.sha256,
         plan=row.plan.sha256,
-        feasible=row.feasible,
         headline=headline_of(row, settings),
-        report=row.report,
         picture=f"{here}/picture.png",
         pictures=PictureLinks(
             picture=f"{here}/picture.png",
@@ -167,6 +165,5 @@ def describe_playback(session: Session, row: StoredPlayback, settings: Settings)
             joints=f"{here}/joints.png",
             clearance=f"{here}/clearance.png",
         ),
-        created_at=row.created_at,
         policy=FollowedPolicy(version=policy.version, sha256=policy.sha256, released=releases.serves(session, policy)),
     )

@@ -276,23 +276,23 @@ def withdraw_all(session: Session, surgeon: Surgeon, actor: str) -> list[Release
     return releases
 
 
-def withdraw_resting_on(session: Session, demonstration: Demonstration, actor: str) -> list[Release]:
-    """Withdraw the releases learnt from a demonstration; if the served one is among them, all of the style."""
-    releases = in_force(session, demonstration.surgeon_row, demonstration.suture)
-    withdrawn = _with_superseded(releases, [r for r in releases if demonstration in r.policy.demonstrations])
-    _withdraw(session, withdrawn, actor)
-    return withdrawn
+def withdraw_resting_on(
+    session: Session, demonstration: Demonstration, actor: str, *, marked: bool = False
+) -> list[Release]:
+    """Withdraw the releases learnt from a demonstration; if the served one is among them, all of the style.
 
-
-def withdraw_failed(session: Session, demonstration: Demonstration, actor: str) -> None:
-    """Withdraw, as `withdraw_resting_on`, releases learnt from a demonstration that is marked recovery or failure.
-
-    Those of versions that were trained from any outcome stay, unless they were superseded by one that is withdrawn.
+    Args:
+        session: The caller's transaction.
+        demonstration: It is withdrawn or erased, or was marked recovery or failure.
+        actor: The actor of the events.
+        marked: It was marked: the releases of versions that were trained from any outcome stay.
     """
     releases = in_force(session, demonstration.surgeon_row, demonstration.suture)
     resting = [one for one in releases if demonstration in one.policy.demonstrations]
-    failed = [one for one in resting if not one.policy.of_any_outcome]
-    _withdraw(session, _with_superseded(releases, failed), actor)
+    ending = [one for one in resting if not (marked and one.policy.of_any_outcome)]
+    withdrawn = _with_superseded(releases, ending)
+    _withdraw(session, withdrawn, actor)
+    return withdrawn
 
 
 def withdraw_policies(session: Session, ended: Mapping[str, datetime], actor: str) -> None:
