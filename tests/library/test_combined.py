@@ -21,7 +21,7 @@ from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans.plans import hand_of, trajectory_of
 from skills.library.policies import training
 from skills.library.policies.cards import card_of
-from skills.library.policies.combined import learnt_from, path_of
+from skills.library.policies.combined import learnt_from
 from skills.library.policies.releases import in_force, release
 from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.versions import find_by_digest
@@ -74,7 +74,7 @@ def test_it_names_all_of_them_passes_the_gate_and_is_verified(database: Database
     with database.reading() as session:
         stored = find_by_digest(session, version.sha256)
         assert [one.sha256 for one in stored.demonstrations] == version.manifest.demos
-        assert digest(path_of(stored)) == digest(learnt(stored).path)
+        assert digest(learnt_from(stored).path) == digest(learnt(stored).path)
     said = version.manifest.combined
     assert said.kind == how.kind
     assert len(said.width_mm) == len(version.manifest.waypoints)
@@ -180,7 +180,7 @@ def test_a_plan_follows_it_and_a_card_tells_of_it(database: Database, how):
     plan = cases.add_plan(database)
     with database.reading() as session:
         stored = find_by_digest(session, version.sha256)
-        followed, card = learnt_from(stored), card_of(session, stored)
+        followed, card = learnt_from(stored).demo, card_of(session, stored)
         assert np.abs(plan.plan.passes[0].tip_mm[-1] - [5.0, 55.0, -125.0]).max() < 1e-9
         assert dtw(plan.plan.passes[0].tip_mm, followed.tip_mm).differences_mm.sum(axis=1).mean() < 5.0
         asked = requested_motion(plan.plan, learnt(stored), hand_of(stored))

@@ -163,8 +163,7 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         certified = _certified(version, others)
         yield certified
         passes = certified.state == "done"
-        questions = [*_questions(asked, passes)]
-        if questions:
+        if questions := _questions(asked, passes):
             yield from questions
             return
         yield _release(database, version, actor, settings, wanted=asked.release is True, passes=passes)
@@ -362,26 +361,36 @@ def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:
     )
 
 
-def _questions(asked: TryIn, passes: bool) -> Iterator[TryStep]:
-    """Yield a step for each question that the request leaves open after the certificate."""
-    if asked.tissue_mm is None:
-        unknown = Choice(words="plan without tissue; the motion is then not exported", change={"tissue_mm": "none"})
-        text = "How high is the tissue, along z of the arm's frame, in mm?"
-        yield TryStep(name="tissue", state="asks", text=text, choices=(unknown,))
-    if asked.errors is None:
-        named = (
-            ("calibrated", "errors of a calibrated arm (docs/errors.md)"),
-            ("uncalibrated", "errors of an arm as it is delivered"),
-        )
-        choices = tuple(Choice(words=words, change={"errors": name}) for name, words in named)
-        yield TryStep(name="errors", state="asks", text="With which errors of the arms is it judged?", choices=choices)
-    if asked.release is None and passes:
-        text = "Release this version, so that it is served? Research use only."
-        yes, no = (
-            Choice(words="release it", change={"release": True}),
-            Choice(words="do not", change={"release": False}),
-        )
-        yield TryStep(name="release", state="asks", text=text, choices=(yes, no))
+def _asks(name: StepName, text: str, *choices: tuple[str, dict[str, Any]]) -> TryStep:
+    chosen = tuple(Choice(words=words, change=change) for words, change in choices)
+    return TryStep(name=name, state="asks", text=text, choices=chosen)
+
+
+QUESTIONS = (
+    _asks(
+        "tissue",
+        "How high is the tissue, along z of the arm's frame, in mm?",
+        ("plan without tissue; the motion is then not exported", {"tissue_mm": "none"}),
+    ),
+    _asks(
+        "errors",
+        "With which errors of the arms is it judged?",
+        ("errors of a calibrated arm (docs/errors.md)", {"errors": "calibrated"}),
+        ("errors of an arm as it is delivered", {"errors": "uncalibrated"}),
+    ),
+    _asks(
+        "release",
+        "Release this version, so that it is served? Research use only.",
+        ("release it", {"release": True}),
+        ("do not", {"release": False}),
+    ),
+)
+
+
+def _questions(asked: TryIn, passes: bool) -> list[TryStep]:
+    """Return a step for each question that the request leaves open after the certificate."""
+    given = {"tissue": asked.tissue_mm, "errors": asked.errors, "release": asked.release if passes else False}
+    return [one for one in QUESTIONS if given[one.name] is None]
 
 
 def _release(

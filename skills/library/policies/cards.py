@@ -40,7 +40,7 @@ from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import card_words as words
 from skills.library.policies import releases
 from skills.library.policies.card_words import sentence, sentences
-from skills.library.policies.combined import combined_of, learnt_from
+from skills.library.policies.combined import learnt_from
 from skills.library.recordings.reports import full_report
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
@@ -108,7 +108,7 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
     recordings = {one.recording.row: one.recording for one in demonstrations}.values()
     # First, so that no fact is taken from a damaged row.
     _refuse_damaged([*recordings, *demonstrations, *rewards, version, *released])
-    coverage, demo, combined = covered(version), learnt_from(version), _combined(version)
+    coverage, learnt_path, combined = covered(version), learnt_from(version), _combined(version)
     facts = PolicyCard.model_construct(  # without the checkpoint of the history, see `Card.under`
         format=FORMAT,
         written_by=f"suture-skills {__version__}",
@@ -126,11 +126,11 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
         metrics=_metrics(version),
         certificate=version.manifest.grid_certificate,
         coverage=_coverage(version, coverage),
-        limits=_limits(version, demo),
+        limits=_limits(version, learnt_path.demo),
         lineage=_lineage(session, version),
         citation=words.citation(version),
     )
-    return Card(facts, demo, learnt(version).path, coverage, combined_of(version))
+    return Card(facts, learnt_path.demo, learnt(version).path, coverage, learnt_path.combined)
 
 
 def _refuse_damaged(rows: Sequence[Any]) -> None:
