@@ -102,7 +102,7 @@ def test_asking_again_gives_the_same_job_until_it_has_failed(database: Database,
         cancel(session, job.id, "test")
     assert f"client.draw('{playback.sha256}')" in refusal(database, playback)
     with database.writing() as session:
-        again, new = playbacks.request_pictures(session, playback, "test")
+        again, new, _ = playbacks.request_pictures(session, playback, "test")
     assert new and again.row != job.row
     assert again.id in refusal(database, playback)
 

@@ -12,7 +12,6 @@ from skills.api.streams import stored_file
 from skills.api.strict_json import Strict
 from skills.db.service_tables import StoredDataset
 from skills.formats import BYTES
-from skills.library.operation.jobs import QUEUED, did_nothing
 from skills.library.recordings import datasets
 from skills.schemas.datasets import DatasetEpisodes, DatasetIn
 from skills.settings import MEBIBYTE
@@ -27,8 +26,8 @@ def export_dataset(body: DatasetIn, db: Db, jobs: Jobs, actor: Actor) -> Respons
     409 if the consent of a surgeon in it does not cover an export.
     """
     with db.writing() as session:
-        job, new = datasets.request_dataset(session, body, actor)
-        answer = accepted(session, job, QUEUED if new else did_nothing(job))
+        job, new, did = datasets.request_dataset(session, body, actor)
+        answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
         jobs.submit(job.row, job.attempt, job.kind)

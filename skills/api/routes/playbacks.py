@@ -13,7 +13,6 @@ from skills.api.strict_json import Strict
 from skills.db.session import Database
 from skills.formats import BYTES
 from skills.library.operation import locks
-from skills.library.operation.jobs import QUEUED, did_nothing
 from skills.library.plans import plans, playbacks
 from skills.library.plans.playback_pictures import find_pictures, request_pictures
 from skills.library.plans.playbacks import describe_playback, find_playback, shown_playback
@@ -30,8 +29,8 @@ def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configure
     with db.reading() as session:
         surgeon = plans.find_plan(session, body.plan).policy.surgeon.slug
     with db.writing([locks.surgeon(surgeon)]) as session:
-        job, new = playbacks.request_playback(session, body.plan, actor, settings, body.arm_errors)
-        answer = accepted(session, job, QUEUED if new else did_nothing(job))
+        job, new, did = playbacks.request_playback(session, body.plan, actor, settings, body.arm_errors)
+        answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
         jobs.submit(job.row, job.attempt, job.kind)
@@ -96,8 +95,8 @@ def draw_pictures(playback: Digest, db: Db, actor: Actor) -> Response:
     with db.reading() as session:
         surgeon = find_playback(session, playback).plan.policy.surgeon.slug
     with db.writing([locks.surgeon(surgeon)]) as session:
-        job, new = request_pictures(session, shown_playback(session, playback), actor)
-        return accepted(session, job, QUEUED if new else did_nothing(job))
+        job, _, did = request_pictures(session, shown_playback(session, playback), actor)
+        return accepted(session, job, did)
 
 
 def _drawn(db: Database, playback: str, which: Callable[[Pictures], bytes]) -> bytes:

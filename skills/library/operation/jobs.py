@@ -147,7 +147,6 @@ def _why(counted: dict[str, int]) -> str | None:
 
 
 LIVE = ("queued", "running", "succeeded")
-QUEUED = "A new job is queued."  # `RequestedJob.did` of a new job
 JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 
 
@@ -188,15 +187,15 @@ class RequestedJob(NamedTuple):
     did: str
 
 
-def ask(session: Session, request: JobRequest, surgeon: Surgeon | None, actor: str) -> tuple[Job, bool]:
-    """Queue work whose inputs are all resolved; return the job, and whether it is new.
+def ask(session: Session, request: JobRequest, surgeon: Surgeon | None, actor: str) -> RequestedJob:
+    """Queue work whose inputs are all resolved.
 
     An equal request that is queued, running or done returns the same job; after a failed or cancelled one a new job is
     queued.
     """
     known = find_live(session, request)
     if known is not None:
-        return known, False
+        return RequestedJob(known, False, did_nothing(known))
     job = Job(
         id=secrets.token_hex(8),
         kind=request.kind,
@@ -209,7 +208,7 @@ def ask(session: Session, request: JobRequest, surgeon: Surgeon | None, actor: s
     session.add(job)
     session.flush()
     record_event(session, actor, "ask", f"job-{job.kind}", job.id, surgeon)
-    return job, True
+    return RequestedJob(job, True, "A new job is queued.")
 
 
 def find_live(session: Session, request: JobRequest) -> Job | None:

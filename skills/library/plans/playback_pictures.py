@@ -11,7 +11,7 @@ from skills.db.session import Database
 from skills.errors import NotDrawnYet
 from skills.fields import as_json
 from skills.library.operation import jobs
-from skills.library.operation.jobs import PICTURES, JobRequest, Store
+from skills.library.operation.jobs import PICTURES, JobRequest, RequestedJob, Store
 from skills.remedies import Action, Remedy
 from skills.schemas.results import PicturesResult
 from skills.settings import Settings
@@ -27,8 +27,8 @@ class PicturesRequest(JobRequest):
     playback: str
 
 
-def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> tuple[Job, bool]:
-    """Queue the pictures of a stored playback; return the job, and whether it is new."""
+def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> RequestedJob:
+    """Queue the pictures of a stored playback."""
     return jobs.ask(session, _wanted(playback), playback.plan.policy.surgeon, actor)
 
 

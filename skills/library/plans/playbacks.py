@@ -13,11 +13,11 @@ from sqlalchemy.orm import Session
 
 from skills.db.models import StoredPlayback
 from skills.db.packed import digest
-from skills.db.service_tables import Job, record_event
+from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest, learnt, planned
-from skills.library.operation.jobs import JobRequest, Store
+from skills.library.operation.jobs import JobRequest, RequestedJob, Store
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.plans.headline import CHECK_VERSION, headline
 from skills.library.plans.plans import check_frame, find_plan, hand_of, trajectory_of
@@ -45,8 +45,8 @@ class PlaybackRequest(JobRequest):
 
 def request_playback(
     session: Session, plan_sha256: str, actor: str, settings: Settings, errors: ArmErrors | None = None
-) -> tuple[Job, bool]:
-    """Queue the playback of a plan in the simulator; return the job, and whether it is new.
+) -> RequestedJob:
+    """Queue the playback of a plan in the simulator.
 
     Args:
         session: The caller's transaction.

@@ -90,8 +90,7 @@ def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
     if known is not None and known.state == "succeeded":
         # What it reported may have been withdrawn or erased since, so it is tried again, not looked up.
         request = request.model_copy(update={"again": secrets.token_hex(8)})
-    job, new = jobs.ask(session, request, surgeon, actor)
-    return RequestedJob(job, new, jobs.QUEUED if new else jobs.did_nothing(job))
+    return jobs.ask(session, request, surgeon, actor)
 
 
 def perform_try(database: Database, request: TryRequest, settings: Settings) -> Store[TryResult]:
@@ -171,9 +170,7 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         plan, words = _plan(database, asked, version, actor)
         yield _done("plan", words, plan)
         at = "play"
-        playback, words = _play(database, asked, plan, actor, settings)
-        yield _done("play", words, playback)
-        yield _verdict(database, asked, playback, settings, others)
+        yield from _play(database, asked, plan, actor, settings, others)
     except SkillsError as refused:
         if isinstance(least_mm := refused.numbers.get("least_mm"), float):
             reached_mm = ceil(10 * least_mm) / 10
@@ -432,40 +429,29 @@ def _plan(database: Database, asked: TryIn, version: PolicyVersion, actor: str) 
     )
 
 
-def _play(database: Database, asked: TryIn, plan: str, actor: str, settings: Settings) -> tuple[str, str]:
-    """Play a plan in the simulator; return the playback's digest, and the step in words."""
+def _play(
+    database: Database, asked: TryIn, plan: str, actor: str, settings: Settings, others: Sequence[Choice]
+) -> Iterator[TryStep]:
+    """Play a plan in the simulator; yield the step of the playback, and that of the verdict."""
     store = check_playback(database, playback_request(plan, settings, asked.arm_errors), settings)
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
         playback = store(session, actor).playback
     with database.reading() as session:
         row = find_playback(session, playback)
-    errors = row.report.doubt.under[0].errors.name
-    words = f"{row.report.samples} samples in the simulator, and 1000 worlds with {describe_errors(errors)}."
-    return playback, words
-
-
-def _verdict(database: Database, asked: TryIn, playback: str, settings: Settings, others: Sequence[Choice]) -> TryStep:
-    with database.reading() as session:
-        row = find_playback(session, playback)
-        line, failure = headline_of(row, settings), row.report.failure
+        line, report = headline_of(row, settings), row.report
         lowest_mm = min(z for one in row.plan.about.passes for _, _, z in one.path_mm)
-    choices: list[Choice] = []
-    remedies: list[str] = []
-    if line.level == "bad" and failure is None and asked.errors == "uncalibrated":
+    errors = describe_errors(report.doubt.under[0].errors.name)
+    yield _done("play", f"{report.samples} samples in the simulator, and 1000 worlds with {errors}.", playback)
+    verdict = _done("verdict", line.text, playback)
+    if line.level == "bad" and report.failure is None and asked.errors == "uncalibrated":
         words = "judge it with the errors of a calibrated arm, if yours is one"
-        choices.append(Choice(words=words, change={"errors": "calibrated"}))
-    elif failure is not None and failure.quantity == SCENE:
-        remedies.append(
+        others = [Choice(words=words, change={"errors": "calibrated"})]
+    elif report.failure is None:
+        others = ()
+    elif report.failure.quantity == SCENE:
+        measure = (
             f"Measure the tissue again: it is stated at {asked.tissue_mm} mm, and the tip goes down to {lowest_mm:.1f} "
             "mm. Or record the hand-off further above it."
         )
-    elif failure is not None:
-        choices += others
-    return TryStep(
-        name="verdict",
-        state="done",
-        text=line.text,
-        choices=tuple(choices),
-        remedies=tuple(remedies),
-        id=playback,
-    )
+        others, verdict = (), verdict.model_copy(update={"remedies": (measure,)})
+    yield verdict.model_copy(update={"choices": tuple(others)})

@@ -173,25 +173,10 @@ def release(
         Corrupt: The stored policy does not match its digest.
     """
     consent.require(policy.surgeon, "training")
-    released, reasons = _release(session, policy, actor, constant_turn_deg)
-    if released is None:
-        raise _not_releasable(policy, reasons)
-    return released
-
-
-def _not_releasable(policy: PolicyVersion, reasons: Sequence[GateRefusal]) -> Conflict:
-    text = f"Version {policy.version} cannot be released: {join_reasons(reasons)}."
-    return Conflict(text, reasons=[one.text for one in reasons])
-
-
-def _release(
-    session: Session, policy: PolicyVersion, actor: str, constant_turn_deg: float
-) -> tuple[Release | None, list[GateRefusal]]:
-    """Release a version that consent covers; return its release, or None and the reasons against it."""
     learnt(policy)
     served = in_force(session, policy.surgeon_row, policy.suture)
     if served and served[0].policy_row == policy.row:
-        return served[0], []
+        return served[0]
     reasons = [*policy.manifest.grid_certificate.refused_because, *changed_demonstrations(policy)]
     reasons += _held(policy, constant_turn_deg)
     # Only phased policies have to reproduce their demonstration; one of the cell state must at least not be worse.
@@ -204,13 +189,14 @@ def _release(
             )
             reasons.append(GateRefusal("worse", text))
     if reasons or not policy.releasable:
-        return None, reasons
+        text = f"Version {policy.version} cannot be released: {join_reasons(reasons)}."
+        raise Conflict(text, remedy(reasons), reasons=[one.text for one in reasons])
     released = Release(policy=policy, surgeon_row=policy.surgeon_row, suture=policy.suture, released_by=actor)
     session.add(released)
     record_event(session, actor, "release", "policy-version", policy.sha256, policy.surgeon)
     session.flush()
     announce(session)
-    return released, []
+    return released
 
 
 class Released(NamedTuple):
@@ -228,9 +214,10 @@ def try_release(session: Session, policy: PolicyVersion, actor: str) -> Released
     """Release a policy version if it passes the gate, as `release` does; return why it was not released."""
     if (without := consent.refusal(policy.surgeon, "training")) is not None:
         return Released(False, without.words(), remedy([GateRefusal("consent", without.message)]))
-    released, reasons = _release(session, policy, actor, CONSTANT_TURN_DEG)
-    if released is None:
-        return Released(False, _not_releasable(policy, reasons).words(), remedy(reasons))
+    try:
+        release(session, policy, actor)
+    except Conflict as refused:
+        return Released(False, refused.message, " ".join(refused.advice(None)))
     return Released(True, None, None)
 
 

@@ -17,7 +17,7 @@ from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.library.operation import jobs, locks
-from skills.library.operation.jobs import BATCH, PART, PartRequest, RequestedJob, did_nothing
+from skills.library.operation.jobs import BATCH, PART, PartRequest, RequestedJob
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
@@ -85,9 +85,10 @@ def request_retraining(
     names = [] if batch.surgeon is None else [locks.surgeon(batch.surgeon)]
     with database.writing([locks.BATCHES, *names]) as session:
         who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
-        job, new = jobs.ask(session, request, who, actor)
-        if not new:
-            return RequestedJob(job, False, _did_nothing(session, job))
+        requested = jobs.ask(session, request, who, actor)
+        job = requested.job
+        if not requested.new:
+            return requested if job.state != "succeeded" or not request.release else _done_before(session, job)
     # Rows are inserted only for a new job; an equal one has its own.
     size = max(1, min(MOST_IN_A_PART, -(-len(styles) // FEWEST_PARTS)))
     at_once = STYLES_AT_ONCE // size * size
@@ -176,11 +177,10 @@ def _unsettled(
         asked = asked.model_copy(update={"after": known.id})
 
 
-def _did_nothing(session: Session, job: Job) -> str:
-    if job.state != "succeeded" or not job.request["release"]:
-        return did_nothing(job)
+def _done_before(session: Session, job: Job) -> RequestedJob:
     serving, done = jobs.count_serving(session, job.row)
-    return f"Nothing: an equal batch trained {done} styles, and {serving} of them serve its version, as when it ended."
+    did = f"Nothing: an equal batch trained {done} styles, and {serving} of them serve its version, as when it ended."
+    return RequestedJob(job, False, did)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from skills.learning.policy import Learner, refuse_loops, refuse_too_large
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.ties import rule_in
 from skills.library.operation import jobs
-from skills.library.operation.jobs import QUEUED, RequestedJob, Store, did_nothing
+from skills.library.operation.jobs import RequestedJob, Store
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
@@ -67,11 +67,10 @@ def request_training(
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
     request, who = training_request(session, training, limits)
-    job, new = jobs.ask(session, request, who, actor)
-    if new:
-        return RequestedJob(job, True, QUEUED)
-    again = training.release and job.state == "succeeded"
-    return RequestedJob(job, False, _release_again(session, job, actor) if again else did_nothing(job))
+    requested = jobs.ask(session, request, who, actor)
+    if requested.new or not training.release or requested.job.state != "succeeded":
+        return requested
+    return requested._replace(did=_release_again(session, requested.job, actor))
 
 
 def training_request(session: Session, training: TrainingIn, limits: GateLimits) -> tuple[TrainingRequest, Surgeon]:

@@ -45,7 +45,7 @@ from skills.formats.lerobot.writer import (
 )
 from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest
-from skills.library.operation.jobs import EXPORT, UNSYNCHRONISED, JobRequest, Store
+from skills.library.operation.jobs import EXPORT, UNSYNCHRONISED, JobRequest, RequestedJob, Store
 from skills.library.people import consent
 from skills.library.people.recorded import RECORDED, episodes_of, overlap, recorded_in
 from skills.library.people.surgeons import find_surgeon
@@ -102,8 +102,8 @@ class _Chosen(NamedTuple):
         return self.outcome not in (None, SUCCESS)
 
 
-def request_dataset(session: Session, asked: DatasetIn, actor: str) -> tuple[Job, bool]:
-    """Queue an export, with all defaults resolved; return the job, and whether it is new.
+def request_dataset(session: Session, asked: DatasetIn, actor: str) -> RequestedJob:
+    """Queue an export, with all defaults resolved.
 
     Args:
         session: The caller's transaction.
@@ -128,14 +128,14 @@ def request_dataset(session: Session, asked: DatasetIn, actor: str) -> tuple[Job
         episodes=len({one.recording_row for one in chosen}) if asked.whole else len(chosen),
         demos_sha256=sha256(canonical([[one.sha256, splits[one.row]] for one in chosen])),
     )
-    job, new = jobs.ask(session, request, None, actor)
-    if new:
+    requested = jobs.ask(session, request, None, actor)
+    if requested.new:
         exported = [
-            {"job_row": job.row, "demonstration_row": one.row, "split": splits[one.row], "whole": asked.whole}
+            {"job_row": requested.job.row, "demonstration_row": one.row, "split": splits[one.row], "whole": asked.whole}
             for one in chosen
         ]
         session.execute(insert(DatasetDemonstration), exported)
-    return job, new
+    return requested
 
 
 def _chosen(session: Session, asked: DatasetIn) -> list[_Chosen]:
