@@ -103,7 +103,7 @@ def test_the_middle_lies_between_the_demonstrations(database: Database):
     demos = add_three(database)
     version = train(database, demos, combine=Barycentre())
     with database.reading() as session:
-        way = learnt_from(find_by_digest(session, version.sha256))
+        way = learnt_from(find_by_digest(session, version.sha256)).demo
     between = cases.points_mm((0.0, 1.5, 0.5))
     assert dtw(way.tip_mm, between).differences_mm.sum(axis=1).mean() < 1.0
 

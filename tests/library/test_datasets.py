@@ -266,7 +266,7 @@ def test_a_second_attempt_writes_the_same_bytes(database: Database):
     cut_short = export_dataset(database, DatasetRequest.model_validate(job.request), Settings())
     assert kept(database) == (0, 0, 1)
     with database.writing() as session:
-        digest = cut_short(session, "test")["dataset"]
+        digest = cut_short(session, "test").dataset
         session.rollback()
     assert kept(database) == (0, 0, 1)
     assert cases.work(database, job).result["dataset"] == digest

@@ -160,8 +160,8 @@ def test_what_cannot_be_compared_is_worse(totals_mm: tuple[float, float]):
 
 def test_in_another_frame_nothing_is_compared():
     path = fit.GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), fit.np.array([0, 1, 2]))
-    ways = [fit.PolicyPath(path.tip_mm, ("PSM2", frame)) for frame in ("PSM2_base", "jigsaws")]
-    one = fit.ReferencePath("a" * 64, ("PSM2", "PSM2_base"), path)
+    ways = [fit.StylePath("b" * 64, ("PSM2", frame), path.tip_mm) for frame in ("PSM2_base", "jigsaws")]
+    one = fit.StylePath("a" * 64, ("PSM2", "PSM2_base"), path.tip_mm)
     found = fit.compare_paths(*ways, [one])
     assert (not_worse(found), found.released_mm, found.trained_mm) == (False, None, None)
     assert not_worse(fit.compare_paths(ways[0], ways[0], [one]))

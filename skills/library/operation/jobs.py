@@ -308,11 +308,8 @@ def list_jobs(
     query = select(Job).where(*shown()).order_by(Job.row.desc()).limit(limit)
     if before is not None:
         query = query.where(Job.row < before)
-    if state is not None:
-        query = query.where(Job.state == state)
-    if kind is not None:
-        query = query.where(Job.kind == kind)
-    return session.scalars(query).all()
+    asked = {"state": state, "kind": kind}
+    return session.scalars(query.filter_by(**{name: one for name, one in asked.items() if one is not None})).all()
 
 
 def names_of(session: Session, row: int) -> list[str] | None:

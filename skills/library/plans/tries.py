@@ -17,8 +17,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from math import ceil
-from typing import Any, ClassVar
+from typing import ClassVar
 
+from pydantic import JsonValue
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
@@ -305,14 +306,16 @@ def _other_parts(proposed: Sequence[Segment], taken: int | str | None) -> list[C
 def _finer(chosen: Cells, measured: Sequence[Cells]) -> list[Choice]:
     """Return the next finer cells, and the hysteresis where there is none, as choices after a refusal."""
     after = [one for one in measured if one.cell_mm < chosen.cell_mm][:2]
-    found = [Choice(words=f"use {one.named} (they lose {one.loss_mm:.2f} mm)", change=_change(one)) for one in after]
+    found = [
+        Choice(
+            words=f"use {one.named} (they lose {one.loss_mm:.2f} mm)",
+            change={"cell_mm": one.cell_mm, "hysteresis": one.hysteresis},
+        )
+        for one in after
+    ]
     if not chosen.hysteresis:
         found.append(Choice(words="use hysteresis 0.25", change={"hysteresis": 0.25}))
     return found
-
-
-def _change(cells: Cells) -> dict[str, Any]:
-    return {"cell_mm": cells.cell_mm, "hysteresis": cells.hysteresis}
 
 
 def _learn(
@@ -358,7 +361,7 @@ def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:
     )
 
 
-def _asks(name: StepName, text: str, *choices: tuple[str, dict[str, Any]]) -> TryStep:
+def _asks(name: StepName, text: str, *choices: tuple[str, dict[str, JsonValue]]) -> TryStep:
     chosen = tuple(Choice(words=words, change=change) for words, change in choices)
     return TryStep(name=name, state="asks", text=text, choices=chosen)
 

@@ -273,8 +273,8 @@ def _measured(session: Session, learnt: Sequence[Learnt], before: Mapping[str, _
     references = reference_paths(session, set().union(*rests_on.values()))
     for one, served in pairs:
         paths = (
-            policy_path(served.manifest, partial(integrity.learnt, served)),
-            policy_path(one.manifest, partial(unpack_as, Policy, one.policy)),
+            policy_path(served.sha256, served.manifest, partial(integrity.learnt, served)),
+            policy_path(one.sha256, one.manifest, partial(unpack_as, Policy, one.policy)),
         )
         same = [path for row, path in references.items() if row in rests_on[served.row]]
         found[one.sha256] = _Measured(served, compare_paths(*paths, same))

@@ -82,7 +82,7 @@ def describe_pose_style(version: PolicyVersion, poses: CertifiedPoses) -> PoseSt
         **path
         | vars(poses)
         | of_version
-        | {"format": FORMAT, "surgeon": version.surgeon.slug, "demos": version.manifest.demos}
+        | {"format": FORMAT, "surgeon": version.surgeon.slug, "demos": version.manifest.demos, "tick_s": poses.tick_s}
         | {"position_mm": path["tip_mm"], "partner_motion": partner_motion}
     )
 

@@ -6,7 +6,6 @@
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy import ColumnElement, Text, cast, func, insert, select, update
 from sqlalchemy.orm import Session
@@ -96,7 +95,7 @@ def request_retraining(
         with database.writing([locks.job(job.row)]) as session:
             if session.scalar(select(Job.row).where(Job.row == job.row, Job.state.in_(jobs.ACTIVE))) is None:
                 break  # cancelled or erased meanwhile
-            _divide(session, job, styles[first : first + at_once], size)
+            _divide(session, job, [*styles.items()][first : first + at_once], size)
     with database.writing([locks.job(job.row)]) as session:
         session.execute(update(Job).where(Job.row == job.row).values(submitted_at=now()), **jobs.UNSYNCHRONISED)
         jobs.settle(session, job.row)  # a batch without styles, or whose styles are all done, ends here
@@ -112,8 +111,8 @@ def request_retraining(
 
 def choose_styles(
     session: Session, batch: RetrainingIn, limits: GateLimits = DEFAULT_LIMITS
-) -> tuple[RetrainingRequest, list[dict[str, Any]]]:
-    """Return the request of a batch's job, and for each of its styles the demonstration and why it is stale.
+) -> tuple[RetrainingRequest, dict[int, list[str]]]:
+    """Return the request of a batch's job, and by the demonstration of each of its styles why it is stale.
 
     The arguments and errors are those of `request_retraining`.
     """
@@ -142,7 +141,7 @@ def choose_styles(
     stale = _reasons(session, demos, trainings, asked, _styles(PolicyVersion, who, what))
     chosen = [demo.row for demo in demos if stale[demo.row] or not batch.only_stale]
     request, unsettled = _unsettled(session, asked, chosen, trainings)
-    return request, [{"demonstration_row": row, "stale": stale[row]} for row in unsettled]
+    return request, {row: stale[row] for row in unsettled}
 
 
 def _training_of(
@@ -254,11 +253,11 @@ def _reasons(
     return reasons
 
 
-def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]], size: int) -> None:
+def _divide(session: Session, job: Job, styles: Sequence[tuple[int, list[str]]], size: int) -> None:
     """Insert a row for each of some styles, and divide them into parts; a demonstration that was erased is left out."""
-    demos = [style["demonstration_row"] for style in styles]
+    demos = [row for row, _ in styles]
     there = set(session.scalars(select(Demonstration.row).where(Demonstration.row.in_(demos))))
-    left = [style for style in styles if style["demonstration_row"] in there]
+    left = [(row, stale) for row, stale in styles if row in there]
     parts = [
         # without its request and identity, which name its row
         Job(
@@ -277,7 +276,10 @@ def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]], size: 
     for number, part in enumerate(parts):
         request = PartRequest(retraining=job.row, part=part.row)
         part.request, part.identity = request.stored, request.identity
-        rows += [{"job_row": job.row, "part_row": part.row, **style} for style in left[number * size :][:size]]
+        rows += [
+            {"job_row": job.row, "part_row": part.row, "demonstration_row": row, "stale": stale}
+            for row, stale in left[number * size :][:size]
+        ]
     session.execute(insert(StyleToRetrain), rows)
 
 
