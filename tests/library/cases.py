@@ -94,6 +94,12 @@ def store(database: Database, sent: Upload, surgeon: str = "kestrel", **cut: Any
     return upload_demo(database, sent, DemoIn(surgeon=surgeon, suture=SUTURE, **cut), "test").row
 
 
+def trained(database: Database, data: bytes | None = None, **asked: Any) -> PolicyVersion:
+    """Store one demonstration and train from it; return the version."""
+    add_demo(database, data)
+    return train(database, **asked)
+
+
 def ask_training(database: Database, surgeon: str = "kestrel", **asked: Any) -> Job:
     with database.writing() as session:
         if "learner" in asked:

@@ -109,8 +109,7 @@ def test_a2_ends_where_both_arms_were_recorded(database: Database):
 
 
 def test_positions_alone_are_planned_with_the_jaw_held_and_said_so(database: Database):
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     plan = cases.add_plan(database)
     assert (plan.about.orientation, plan.about.departure) == ("assumed tool-down", None)
     assert plan.about.trajectory.jaw == "constant"

@@ -35,8 +35,7 @@ def loop() -> bytes:
 
 def test_a_loop_that_ends_beside_its_start_is_refused_with_the_remedy(database):
     cases.add_surgeon(database)
-    cases.add_demo(database, loop())
-    version = cases.train(database)
+    version = cases.trained(database, loop())
     certificate = version.manifest.grid_certificate
     assert certificate.near == NearStarts(radius_mm=3.0, least_share=0.4, starts=7, share=0.0)
     (refused,) = certificate.refused_because
@@ -62,8 +61,7 @@ def test_the_gate_refuses_a_near_start_below_its_limit_and_nan(share, refused):
 
 def test_the_gates_limit_is_a_setting_and_part_of_a_trainings_identity(database):
     cases.add_surgeon(database)
-    cases.add_demo(database, loop())
-    refused = cases.train(database)
+    refused = cases.trained(database, loop())
     with database.writing() as session:
         asked = TrainingIn(surgeon="kestrel", suture=cases.SUTURE)
         job = request_training(session, asked, "test", GateLimits(NearLimits(3.0, 0.0))).job
@@ -75,8 +73,7 @@ def test_the_gates_limit_is_a_setting_and_part_of_a_trainings_identity(database)
 
 def test_a_batch_of_stale_styles_takes_those_checked_by_other_near_limits(database):
     cases.add_surgeon(database)
-    cases.add_demo(database, loop())
-    cases.train(database)
+    cases.trained(database, loop())
     asked = RetrainingIn(surgeon="kestrel", only_stale=True)
     for near, stale in ((NearLimits(), []), (NearLimits(3.0, 0.0), [["other limits at the near starts"]])):
         job = request_retraining(database, asked, "test", GateLimits(near))[0]

@@ -225,8 +225,7 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
 
 
 def test_erasure_leaves_no_row_and_events_without_a_name(database: Database):
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     cases.add_plan(database)
     with database.writing() as session:
         subject = find_surgeon(session, "kestrel").subject
@@ -262,8 +261,7 @@ def test_what_was_released_is_what_was_learnt(database: Database):
 
 
 def test_the_first_page_shows_what_the_manifest_states(database: Database):
-    cases.add_demo(database)
-    cases.train(database)
+    cases.trained(database)
     with database.reading() as session:
         manifest = session.scalars(select(PolicyVersion.manifest)).one()
         assert tile(session) == (manifest.waypoints, pytest.approx(manifest.coverage.mean_share))
@@ -279,8 +277,7 @@ def tile(session: Session) -> tuple[list[int], float]:
 
 
 def test_what_value_iteration_finds_may_be_released(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=ValueIteration())
+    version = cases.trained(database, learner=ValueIteration())
     assert version.releasable
     assert version.manifest.learner == "value-iteration"
     assert version.manifest.metrics.dtw_total_mm == 0
@@ -291,8 +288,7 @@ def test_what_value_iteration_finds_may_be_released(database: Database):
 
 
 def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=MaxEntIRL(iterations=30))
+    version = cases.trained(database, learner=MaxEntIRL(iterations=30))
     with database.writing() as session:
         kept = session.get_one(PolicyVersion, version.row)
         assert learnt(kept).learner == MaxEntIRL(iterations=30)
@@ -302,8 +298,7 @@ def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: D
 
 
 def test_a_failing_version_is_not_released_whatever_its_row_says(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=cases.PUBLISHED)
+    version = cases.trained(database, learner=cases.PUBLISHED)
     with database.writing() as session, pytest.raises(Conflict, match="do not reach the goal"):
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
     assert "releases" not in counts(database)

@@ -50,8 +50,7 @@ def store_playback(session: Session, plan: Plan, sha256: str, measured: Playback
 @pytest.fixture
 def playback(database: Database) -> StoredPlayback:
     """Return a playback whose pictures are still to be drawn."""
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     plan = cases.add_plan(database)
     with database.writing() as session:
         measured = ideal_playback(trajectory_of(planned(session.get_one(Plan, plan.row))))

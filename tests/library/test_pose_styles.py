@@ -155,8 +155,7 @@ def test_a_batch_stores_pose_styles_too(database: Database):
 
 def test_a_demonstration_without_orientation_has_no_pose_style(database: Database):
     cases.add_surgeon(database)
-    cases.add_demo(database)
-    version = cases.train(database, release=True)
+    version = cases.trained(database, release=True)
     with database.reading() as session, pytest.raises(NotFound, match="has no orientation") as refused:
         poses_of(session.get_one(PolicyVersion, version.row))
     assert not any(isinstance(one, Remedy) for one in refused.value.remedies)
@@ -308,8 +307,7 @@ def test_a_backup_holds_the_pose_styles(database: Database, tmp_path: Path):
 @pytest.mark.parametrize("changed", ["sha256 = 'e' || substr(sha256, 2)", "policy_row = 1"])
 def test_a_changed_pose_style_is_refused_and_found(database: Database, changed: str):
     cases.add_surgeon(database)
-    cases.add_demo(database)
-    cases.train(database)
+    cases.trained(database)
     demo = add(database, turning(2.5))
     version = cases.train(database, demos=[demo.sha256])
     on = "" if database.engine.dialect.name == "sqlite" else " ON pose_styles"

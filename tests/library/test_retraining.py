@@ -64,8 +64,7 @@ def test_all_styles_of_a_surgeon_or_of_a_suture_type_are_trained_once_each(datab
 
 
 def test_a_style_in_a_batch_is_trained_as_by_a_training_of_its_own(database: Database):
-    cases.add_demo(database)
-    alone = cases.train(database)
+    alone = cases.trained(database)
     (style,) = styles_of(database, retrain(database))
     assert (style.policy_row, count_versions(database)) == (alone.row, 1)
     other = ValueIteration()
@@ -104,8 +103,7 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
     nothing = ask_retraining(database, only_stale=True)
     assert (nothing.state, nothing.progress, nothing.request["styles"]) == ("succeeded", 1.0, 0)
     assert ask_retraining(database, only_stale=True).row == nothing.row
-    cases.add_demo(database)
-    older = cases.train(database)
+    older = cases.trained(database)
     cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)))
     assert reasons() == [["a newer demonstration"]]
     assert reasons(learner=ValueIteration(), surgeon="kestrel") == [["other settings"]]
@@ -226,8 +224,7 @@ def test_retraining_releases_only_on_request_and_stores_the_comparison(database:
 
 
 def test_a_worse_version_is_kept_and_not_released(database: Database):
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     job = retrain(database, release=True, learner=CellQLearning(episodes=3))
     (style,) = styles_of(database, job)
     assert (job.state, style.state, style.policy.version) == ("succeeded", "done", 2)
