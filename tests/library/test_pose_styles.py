@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from sqlalchemy import delete, func, select, text
 
-from skills.comparison.combining import Corridor
 from skills.db.models import Demonstration, ParsedChunk, ParsedRecording, PolicyVersion, StoredPoses
 from skills.db.session import Database
 from skills.demonstration.motion import Motion, Signal
@@ -211,10 +210,10 @@ def test_the_other_arm_is_learnt_if_every_recording_has_it_all_along(database: D
     cases.add_surgeon(database)
     has = [add_both(database, shift) for shift in (0.0, 2.5)]
     has_not = add(database, turning(1.0, **{"other": "PSM1"} | without), arm="PSM2", segment="whole")
-    both = cases.train(database, demos=[one.sha256 for one in has], combine=Corridor())
+    both = cases.train(database, demos=[one.sha256 for one in has], combine="corridor")
     other = beside(database, both)
     assert other is not None and other.arm == "PSM1"
-    mixed = cases.train(database, demos=[one.sha256 for one in (*has, has_not)], combine=Corridor())
+    mixed = cases.train(database, demos=[one.sha256 for one in (*has, has_not)], combine="corridor")
     assert beside(database, mixed) is None
     assert wrong(database) == []
 

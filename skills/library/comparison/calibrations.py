@@ -218,7 +218,7 @@ def _ratings(trials: Sequence[Trial]) -> dict[str, jigsaws.RatedTrial]:
 
 
 def _ratings_of_task(trials: Sequence[Trial]) -> dict[str, jigsaws.RatedTrial]:
-    meta = _meta(trials[0])
+    meta = trials[0].meta
     if not meta.is_file():
         raise BadInput(
             f"There is no {meta}; it must have the ratings, one line per trial: TASK_B001, N, 13, 3 2 1 2 2 3."
@@ -252,18 +252,14 @@ def _counts(used: Sequence[Trial], ratings: dict[str, jigsaws.RatedTrial]) -> Ta
 def _without_file(trials: Sequence[Trial]) -> list[str]:
     """Return the names of the trials that have a rating and no file."""
     listed: set[str] = set()
-    for meta in {_meta(trial) for trial in trials}:
+    for meta in {trial.meta for trial in trials}:
         listed |= jigsaws.read_meta(meta.read_text(errors="replace")).keys()
     return sorted(listed - {trial.name for trial in trials})
 
 
-def _meta(trial: Trial) -> Path:
-    return trial.kinematics.parents[2] / f"meta_file_{trial.task}.txt"
-
-
 def _files(trials: Sequence[Trial]) -> set[Path]:
     """Return the paths of all files that a cohort was read from."""
-    return {trial.kinematics for trial in trials} | {_meta(trial) for trial in trials}
+    return {trial.kinematics for trial in trials} | {trial.meta for trial in trials}
 
 
 def _measured(trial: Trial) -> TrialFigures | None:

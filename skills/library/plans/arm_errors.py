@@ -22,7 +22,7 @@ import numpy as np
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput, BadRecording, BadSettings
 from skills.formats import SUFFIXES, media_type_of, read_recording
-from skills.formats.cells import header_of, open_text, read_numbers
+from skills.formats.cells import TableLayout, header_of, open_text, read_numbers
 from skills.formats.rosbag import Suffix, positions_on
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
 from skills.verification.arm_calibration import MeasuredArm
@@ -149,7 +149,8 @@ def _of_table(opened: BinaryIO, instrument: str, rate_hz: float | None) -> Measu
         if missing := [name for name in _NEEDED if name not in names]:
             raise BadInput(f"The table has no column {missing[0]}; give {', '.join(_NEEDED)} in rad and m.")
         wanted = [name for name in (*_NEEDED, *_MARKER, "t_s") if name in names]
-        numbers = read_numbers(text, names, [[names.index(name)] for name in wanted], separator)
+        layout = TableLayout(names, [[names.index(name)] for name in wanted], separator)
+        numbers = read_numbers(text, layout)
     columns = {name: group[:, 0] for name, group in zip(wanted, numbers.groups, strict=True)}
     if rate_hz is not None and not 0 < rate_hz <= 10_000:
         raise BadInput("The rate must be a number of samples per second above 0, at most 10000.", rate_hz=rate_hz)

@@ -443,7 +443,7 @@ def _play(
         row = find_playback(session, playback)
         line, report = headline_of(row, settings), row.report
         lowest_mm = min(z for one in row.plan.about.passes for _, _, z in one.path_mm)
-    errors = describe_errors(report.doubt.under[0].errors.name)
+    errors = describe_errors(report.estimate.under[0].errors.name)
     yield _done("play", f"{report.samples} samples in the simulator, and 1000 worlds with {errors}.", playback)
     verdict = _done("verdict", line.text, playback)
     if line.level == "bad" and report.failure is None and asked.errors == "uncalibrated":

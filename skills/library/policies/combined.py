@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from sqlalchemy.orm import Session
 
-from skills.comparison.combining import COMBININGS, Combined, Combining, Followed, followed
+from skills.comparison.combining import Combined, Combining, Followed, followed
 from skills.db.models import Demonstration, PolicyVersion, Surgeon
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, Conflict
@@ -86,11 +86,6 @@ def refuse_unlike(demonstrations: Sequence[Demonstration]) -> None:
             )
 
 
-def combining_of(kind: str) -> Combining:
-    """Return the way of combining of a kind."""
-    return COMBININGS[kind]()
-
-
 def describe_combined(found: Followed, how: Combining, demos: Sequence[str]) -> CombinedFigures:
     """Return the description of a combination: its kind, its medoid, and the widths and distances of the combined path.
 
@@ -101,7 +96,7 @@ def describe_combined(found: Followed, how: Combining, demos: Sequence[str]) -> 
     """
     combined = found.combined
     return CombinedFigures(
-        kind=how.kind,
+        kind=how,
         medoid=demos[combined.medoid],
         at=demos[combined.at],
         moved=combined.moved,
@@ -128,5 +123,5 @@ def learnt_from(version: PolicyVersion) -> LearntFrom:
     rows, combined = version.demonstrations, version.manifest.combined
     if combined is None:
         return LearntFrom(rows[0].demo, rows[0].path, None)
-    found = followed([one.demo for one in rows], [one.path for one in rows], combining_of(combined.kind))
+    found = followed([one.demo for one in rows], [one.path for one in rows], combined.kind)
     return LearntFrom(found.demo, found.path, found.combined)

@@ -31,7 +31,7 @@ from skills.learning.ties import rule_in
 from skills.learning.tube import certified_poses
 from skills.library.operation.integrity import poses_identity_of, scene_digest
 from skills.library.people.consent import refusal, require
-from skills.library.policies.combined import combining_of, describe_combined
+from skills.library.policies.combined import describe_combined
 from skills.library.policies.gate import driven_or_refused, refusals
 from skills.library.policies.releases import Style
 from skills.library.policies.requests import TrainingRequest
@@ -169,9 +169,8 @@ def combined_lesson(lessons: Sequence[Lesson], combine: CombineIn | None) -> Les
     """
     if combine is None:
         return lessons[0]
-    how = combining_of(combine.kind)
     rewards = [unpack_as(RewardMap, lesson.reward) for lesson in lessons]
-    found = followed([unpack_as(Demo, one.demo) for one in lessons], [reward.path for reward in rewards], how)
+    found = followed([unpack_as(Demo, one.demo) for one in lessons], [reward.path for reward in rewards], combine.kind)
     at = found.combined.at
     return replace(
         lessons[at],
@@ -182,7 +181,7 @@ def combined_lesson(lessons: Sequence[Lesson], combine: CombineIn | None) -> Les
         partners=tuple(partner for lesson in lessons for partner in lesson.partners),
         at=at,
         others=tuple(lesson.row for lesson in lessons if lesson is not lessons[at]),
-        combined=describe_combined(found, how, [lesson.sha256 for lesson in lessons]),
+        combined=describe_combined(found, combine.kind, [lesson.sha256 for lesson in lessons]),
     )
 
 

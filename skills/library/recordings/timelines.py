@@ -61,7 +61,7 @@ def timeline_of(database: Database, source: Source, sha256: str, parse: Parser) 
         newest = select(StoredPlayback).where(StoredPlayback.plan_row == plan.row)
         played = session.scalar(newest.order_by(StoredPlayback.row.desc()).limit(1))
         measured = None if played is None else played.measured
-        passes = () if played is None else played.report.doubt.under[0].passes
+        passes = () if played is None else played.report.estimate.under[0].passes
     odds = {number: one.succeeds.probability for number, one in enumerate(passes)}
     return timeline_of_plan(trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds)
 
