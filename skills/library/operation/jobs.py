@@ -146,7 +146,6 @@ def _why(counted: dict[str, int]) -> str | None:
     return f"{counted['cancelled']} of {styles} styles were cancelled." if counted["cancelled"] else None
 
 
-LIVE = ("queued", "running", "succeeded")
 JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 
 
@@ -193,15 +192,17 @@ def ask(session: Session, request: JobRequest, surgeon: Surgeon | None, actor: s
     An equal request that is queued, running or done returns the same job; after a failed or cancelled one a new job is
     queued.
     """
-    known = find_live(session, request)
+    stored = request.stored
+    identity = identity_of(request.kind, stored)
+    known = _live(session, identity)
     if known is not None:
         return RequestedJob(known, False, did_nothing(known))
     job = Job(
         id=secrets.token_hex(8),
         kind=request.kind,
-        identity=request.identity,
-        request=request.stored,
-        plan=request.stored.get("plan"),
+        identity=identity,
+        request=stored,
+        plan=stored.get("plan"),
         surgeon_row=surgeon.row if surgeon else None,
         requested_by=actor,
     )
@@ -213,7 +214,11 @@ def ask(session: Session, request: JobRequest, surgeon: Surgeon | None, actor: s
 
 def find_live(session: Session, request: JobRequest) -> Job | None:
     """Return the job of an equal request that is queued, running or done, even if the caller may not see it."""
-    alike = select(Job).where(Job.identity == request.identity, Job.state.in_(LIVE))
+    return _live(session, request.identity)
+
+
+def _live(session: Session, identity: str) -> Job | None:
+    alike = select(Job).where(Job.identity == identity, Job.state.in_(("queued", "running", "succeeded")))
     # All rows, not only the caller's: an equal job must not be queued twice.
     return session.scalar(alike.execution_options(**ALL_ROWS))
 

@@ -1,8 +1,7 @@
 """The release gate: reasons on the grid and of the arm's joint limits against a release."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan
@@ -23,7 +22,6 @@ from skills.settings import Settings
 
 GATE_VERSION = 1  # part of a training's identity: raise it when the gate's result for an equal policy changes
 
-T = TypeVar("T", NearLimits, OddsLimits)
 _OTHERWISE = "Train it with other settings or another learner, or record the hand-off again."
 # Of several reasons the first one here is remedied: training again is of no use before it.
 _REMEDIES: dict[RefusalKind, str] = {
@@ -57,11 +55,6 @@ class GateLimits(NamedTuple):
 
 
 DEFAULT_LIMITS = GateLimits()
-
-
-def limits_of(kind: type[T], judged: T) -> T:
-    """Return the limits alone under which something was judged."""
-    return kind(**{name: getattr(judged, name) for name in asdict(kind())})
 
 
 def remedy(reasons: Sequence[GateRefusal]) -> str:

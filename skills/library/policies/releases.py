@@ -18,7 +18,6 @@ job.
 
 from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
-from itertools import groupby
 from typing import Any, NamedTuple
 
 from sqlalchemy import (
@@ -291,14 +290,11 @@ def withdraw_policies(session: Session, ended: Mapping[str, datetime], actor: st
         actor: The actor of the events.
     """
     query = select(Release, PolicyVersion.sha256).join(PolicyVersion, PolicyVersion.row == Release.policy_row)
-    query = query.where(Release.withdrawn_at.is_(None))
-    query = query.order_by(Release.surgeon_row, Release.suture, Release.row.desc())
-    withdrawn: list[Release] = []
-    for _, style in groupby(session.execute(query), key=lambda one: (one[0].surgeon_row, one[0].suture)):
-        named = [(one, policy) for one, policy in style]
-        ending = [one for one, policy in named if policy in ended and one.released_at <= ended[policy]]
-        withdrawn += _with_superseded([one for one, _ in named], ending)
-    _withdraw(session, withdrawn, actor)
+    found = session.execute(query.where(Release.withdrawn_at.is_(None)))
+    over = [one for one, sha256 in found if sha256 in ended and one.released_at <= ended[sha256]]
+    for style in sorted({(one.surgeon_row, one.suture) for one in over}):
+        releases = in_force(session, *style)
+        _withdraw(session, _with_superseded(releases, [one for one in releases if one in over]), actor)
 
 
 def _with_superseded(releases: Sequence[Release], ending: list[Release]) -> list[Release]:

@@ -12,7 +12,7 @@ from skills.gridworld.hazards import Surroundings
 from skills.learning.certificate import NearLimits, OddsLimits
 from skills.learning.policy import LEARNER_VERSION, Learner, describe_learner, learner_of
 from skills.library.operation.jobs import BATCH, TRAINING, JobRequest
-from skills.library.policies.gate import GATE_VERSION, limits_of
+from skills.library.policies.gate import GATE_VERSION
 from skills.library.policies.releases import Style, is_served
 from skills.schemas.policies import PolicyManifest
 from skills.schemas.training import CombineIn
@@ -104,13 +104,14 @@ class RetrainingRequest(LearningRequest):
 
 def request_of(manifest: PolicyManifest) -> TrainingRequest:
     """Return the request of which a version is the result, at the versions of today, without a release."""
+    near, scene = manifest.grid_certificate.near, manifest.scene
     return TrainingRequest(
         surgeon=manifest.surgeon,
         suture=manifest.suture,
         demos=manifest.demos,
         learner=manifest.learnt_with,
-        near=limits_of(NearLimits, manifest.grid_certificate.near),
-        odds=None if manifest.scene is None else limits_of(OddsLimits, manifest.scene.near),
+        near=NearLimits(near.radius_mm, near.least_share),
+        odds=None if scene is None else OddsLimits(scene.near.least_finishing, scene.near.most_touching),
         seed=manifest.seed,
         combine=None if manifest.combined is None else CombineIn(kind=manifest.combined.kind),
         outcomes=None if manifest.outcomes is None else ANY,
