@@ -8,7 +8,7 @@ import pytest
 
 from skills.db.models import PolicyVersion
 from skills.db.session import Database
-from skills.gridworld.grid import GridWorld
+from skills.gridworld.grid import GridPath, GridWorld
 from skills.library.policies import batches, fit, releases, versions
 from skills.library.policies.fit import compare_versions, not_worse
 from skills.library.recordings.demos import withdraw_demo
@@ -159,7 +159,7 @@ def test_what_cannot_be_compared_is_worse(totals_mm: tuple[float, float]):
 
 
 def test_in_another_frame_nothing_is_compared():
-    path = fit.GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), fit.np.array([0, 1, 2]))
+    path = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), fit.np.array([0, 1, 2]))
     ways = [fit.StylePath("b" * 64, ("PSM2", frame), path.tip_mm) for frame in ("PSM2_base", "jigsaws")]
     one = fit.StylePath("a" * 64, ("PSM2", "PSM2_base"), path.tip_mm)
     found = fit.compare_paths(*ways, [one])
