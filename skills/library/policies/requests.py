@@ -18,9 +18,8 @@ from skills.schemas.policies import PolicyManifest
 from skills.schemas.training import CombineIn
 
 ANY: Literal["any"] = "any"  # `outcomes` of a training from demonstrations of any outcome
-JOIN_AS_SERVED: Literal["as served"] = (
-    "as served"  # `joins` of a batch in which each style keeps the joining rule of its served policy
-)
+# `joins` of a batch in which each style keeps the joining rule of its served policy
+JOIN_AS_SERVED: Literal["as served"] = "as served"
 POSES_VERSION = 1  # part of a training's identity: raise it when equal demonstrations give another pose style
 ROWS_AT_ONCE = 1000  # of a query that reads many manifests, some 3 kB each
 
