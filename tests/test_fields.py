@@ -87,7 +87,7 @@ class Curved(Needle):
     turn_deg: float
 
 
-def test_fields_of_models_are_described_by_docstrings_too_and_those_of_bases():
+def test_fields_of_models_and_of_their_bases_are_described():
     found = Curved.model_json_schema()
     assert found["description"] == "A curved needle."
     assert Needle.model_json_schema()["description"] == "A needle."
