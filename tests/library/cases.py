@@ -1,12 +1,12 @@
 """Small hand-offs as tables and bags, and their way to a playback, with the library calls that the service makes."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from itertools import pairwise
 from threading import Event
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from sqlalchemy import select
@@ -34,6 +34,8 @@ from skills.schemas.people import SurgeonIn
 from skills.schemas.plans import PlanIn
 from skills.schemas.training import TrainingIn
 from skills.settings import Settings
+
+T = TypeVar("T")
 
 SUTURE = "simple-running"
 PUBLISHED = CellQLearning.published()
@@ -77,6 +79,12 @@ def add_surgeon(database: Database, slug: str = "kestrel", **about: Any) -> None
     with database.writing() as session:
         seed_suture_types(session)
         put_surgeon(session, slug, SurgeonIn.model_validate(about), "test")
+
+
+def committed(database: Database, change: Callable[..., T], *asked: Any) -> T:
+    """Call a use case in a transaction of its own."""
+    with database.writing() as session:
+        return change(session, *asked)
 
 
 def agree(session: Session, consent: Any, surgeon: str = "kestrel") -> None:

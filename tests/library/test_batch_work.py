@@ -160,8 +160,7 @@ def test_a_style_refused_at_commit_does_not_roll_back_the_others(database: Datab
 
     def step(lesson: Lesson) -> None:
         if lesson.sha256 == withdrawn:
-            with database.writing() as session:
-                withdraw_demo(session, withdrawn, "test")
+            cases.committed(database, withdraw_demo, withdrawn, "test")
 
     before_learning(step)
     cases.work(database, part)

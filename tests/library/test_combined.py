@@ -148,8 +148,7 @@ def test_one_that_leaves_while_it_is_learnt_from_leaves_no_policy(database: Data
     learnt_meanwhile = training.learn_style(
         training.combined_lesson(read, request.combine), request, Settings(database_url=database.url)
     )
-    with database.writing() as session:
-        leave(session, demos[0].sha256, "test")
+    cases.committed(database, leave, demos[0].sha256, "test")
     with pytest.raises((Conflict, NotFound), match=why), database.writing() as session:
         training.store_style(session, learnt_meanwhile)
     assert rows(database, PolicyVersion) == 0
@@ -168,8 +167,7 @@ def test_the_overview_does_not_wait_for_a_training_of_what_is_among_them(databas
 
 def test_erasing_the_surgeon_leaves_nothing(database: Database):
     train(database, add_three(database), release=True)
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     assert [rows(database, table) for table in (PolicyVersion, PolicyDemonstration, Demonstration)] == [0, 0, 0]
 
 
@@ -215,8 +213,7 @@ def test_what_cannot_be_combined_is_refused_before_a_job_is_made(database: Datab
     ):
         with pytest.raises(BadInput, match=why):
             cases.ask_training(database, demos=[demo.sha256 for demo in demos], combine=how)
-    with database.writing() as session:
-        withdraw_demo(session, two.sha256, "test")
+    cases.committed(database, withdraw_demo, two.sha256, "test")
     with pytest.raises(Conflict, match="withdrawn"):
         cases.ask_training(database, demos=[one.sha256, two.sha256])
 

@@ -186,8 +186,7 @@ def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(datab
 def test_a_demonstration_that_was_withdrawn_is_not_compared_with(database: Database):
     three = demos(database, *SWERVES_MM)
     first, second = cases.train(database, demos=three[:1]), cases.train(database, demos=three[1:2])
-    with database.writing() as session:
-        withdraw_demo(session, three[0], "test")
+    cases.committed(database, withdraw_demo, three[0], "test")
     with database.reading() as session:
         pair = [versions.find_by_digest(session, one.sha256) for one in (first, second)]
         assert compare_versions(session, *pair).demos == (three[1],)

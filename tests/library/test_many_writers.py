@@ -90,8 +90,7 @@ def put(database: Database, slug: str, **about: Any) -> bool:
 
 
 def erase(database: Database) -> None:
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
 
 
 def served(database: Database) -> list[int]:

@@ -143,8 +143,7 @@ def test_a_mark_is_seen_with_its_surgeon_and_goes_with_its_demonstration(databas
     with database.seen_by(Only("somebody", frozenset({mine.surgeon_row}))).reading() as session:
         assert session.scalars(select(DemonstrationOutcome.demonstration_row)).all() == [mine.row]
         assert [one.outcome for one in list_demos(session, 10, None, None, None)] == ["failure"]
-    with database.writing() as session:
-        erase_demo(session, mine.sha256, "test")
+    cases.committed(database, erase_demo, mine.sha256, "test")
     assert counted(database, DemonstrationOutcome) == 1
     assert wrong(database) == []
 

@@ -176,8 +176,7 @@ def test_a_pose_style_is_erased_with_its_demonstration(database: Database):
     demo = add(database, turning())
     cases.train(database)
     assert stored(database) == 1
-    with database.writing() as session:
-        erase_demo(session, demo.sha256, "test")
+    cases.committed(database, erase_demo, demo.sha256, "test")
     assert stored(database) == 0
 
 
@@ -270,8 +269,7 @@ def test_no_recording_is_read_without_consent(database: Database, monkeypatch: p
     cases.add_surgeon(database)
     add_both(database)
     job = cases.ask_training(database)
-    with database.writing() as session:
-        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
+    cases.committed(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
     monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     ended = cases.work(database, job)
     assert ended.state == "failed" and "consent" in (ended.error or "")
@@ -282,8 +280,7 @@ def test_a_recording_that_was_erased_meanwhile_is_named(database: Database):
     demo = add_both(database)
     with database.reading() as session:
         read = training.lessons(session, [demo.row])
-    with database.writing() as session:
-        erase_demo(session, demo.sha256, "test")
+    cases.committed(database, erase_demo, demo.sha256, "test")
     with pytest.raises(NotFound, match=r"A demonstration was erased while the training used it\."):
         training.with_partners(database, read, parse_recording)
 
@@ -317,5 +314,4 @@ def test_a_changed_pose_style_is_refused_and_found(database: Database, changed: 
         poses_of(session.get_one(PolicyVersion, version.row))
     ((where, why),) = wrong(database)
     assert where.startswith("pose_styles") and "does not match its digest" in why
-    with database.writing() as session:
-        withdraw_demo(session, demo.sha256, "test")
+    cases.committed(database, withdraw_demo, demo.sha256, "test")

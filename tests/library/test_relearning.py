@@ -56,8 +56,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cases.train(database, learner=cases.PUBLISHED)
     cases.train(database, scene=SCENE.as_json(), learner=SLIPPING)
     cases.train(database, learner=ValueIteration(), combine="corridor", **two)
-    with database.writing() as session:
-        mark_demo(session, demos[1].sha256, "recovery", None, "test")
+    cases.committed(database, mark_demo, demos[1].sha256, "recovery", None, "test")
     cases.train(database, outcomes="any", combine="corridor", **two)
     with database.writing() as session:  # not as when it was learnt from
         mark_demo(session, demos[2].sha256, "failure", None, "test")
@@ -235,8 +234,7 @@ def test_what_was_erased_meanwhile_is_not_called_wrong(database, monkeypatch):
 
 
 def test_without_consent_nothing_is_learnt_again(database):
-    with database.writing() as session:
-        cases.agree(session, {"uses": []})
+    cases.committed(database, cases.agree, {"uses": []})
     part = parts(database)[RELEARNT]
     assert part.wrong == []
     assert len(part.left_out) == 6

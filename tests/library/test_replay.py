@@ -171,8 +171,7 @@ def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: P
         ({"uses": ["export"]}, "does not cover training"),
         ({"uses": ["training", "export"], "until": "2001-01-01"}, "expired on 2001-01-01"),
     ):
-        with database.writing() as session:
-            cases.agree(session, consent)
+        cases.committed(database, cases.agree, consent)
         refused(database, plan, words)
     with database.writing() as session:
         cases.agree(session, {"uses": ["training", "export"]})
@@ -192,8 +191,7 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
     composed = replay.seal
 
     def withdrawn(members: dict[str, bytes]) -> bytes:
-        with database.writing() as session:
-            cases.agree(session, {"uses": ["training"], "until": None})
+        cases.committed(database, cases.agree, {"uses": ["training"], "until": None})
         return composed(members)
 
     assert replay_bag(database, plan.sha256, OF_A1_ALONE)
