@@ -20,6 +20,7 @@ from skills.formats import write_mcap
 from skills.jobs.workflows import Work
 from skills.learning.policy import describe_learner
 from skills.learning.q_learning import CellQLearning
+from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.jobs import BATCH
 from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
@@ -171,3 +172,9 @@ def add_plan(database: Database, surgeon: str = "kestrel", **asked: Any) -> Plan
         PlanIn(surgeon=surgeon, suture=SUTURE, suture_points=[{"position_mm": (5.0, 55.0, -125.0)}], **asked),
         "test",
     )[0]
+
+
+def wrong(database: Database) -> list[tuple[str, str]]:
+    """Inspect everything that is stored, as `skills verify` does, and return the faults."""
+    parts = {part.what: part for part in inspect_installation(database)}
+    return [one for part in parts.values() for one in part.wrong]

@@ -17,7 +17,6 @@ from skills.library import perform as library
 from skills.library.comparison.scores import LEAST_DEMOS, score
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import keep_erasures, read_erasures
-from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
@@ -33,6 +32,7 @@ from skills.schemas.policies import GateRefusal
 from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
+from tests.library.cases import wrong
 from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, styles_of
 
 WHY = "The needle fell."
@@ -58,10 +58,6 @@ def served(database: Database) -> list[int]:
 def release_again(database: Database, version: PolicyVersion) -> None:
     with database.writing() as session:
         release(session, find_by_digest(session, version.sha256), "test")
-
-
-def wrong(database: Database) -> list[tuple[str, str]]:
-    return [one for part in {id(part): part for part in inspect_installation(database)}.values() for one in part.wrong]
 
 
 def actions(database: Database) -> Sequence[tuple[str, str]]:

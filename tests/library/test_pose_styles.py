@@ -18,7 +18,6 @@ from skills.formats.bag_writer import write_mcap
 from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
-from skills.library.operation.inspection import HISTORY, inspect_installation
 from skills.library.operation.jobs import PartRequest
 from skills.library.people.erasure import erase_demo
 from skills.library.people.surgeons import put_surgeon
@@ -31,6 +30,7 @@ from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
+from tests.library.cases import wrong
 from tests.library.styles import NO_CONSENT, ask_retraining, parts_of, retrain, states_of
 
 MCAP = "application/vnd.mcap"
@@ -104,15 +104,6 @@ def stored(database: Database) -> int:
 def rows_of(database: Database) -> list[Any]:
     with database.reading() as session:
         return [tuple(row) for row in session.execute(text("SELECT sha256, policy_row, poses FROM pose_styles"))]
-
-
-def wrong(database: Database) -> list[tuple[str, str]]:
-    return [
-        one
-        for part in {id(p): p for p in inspect_installation(database)}.values()
-        for one in part.wrong
-        if part.what != HISTORY
-    ]
 
 
 def test_a_training_stores_the_poses_of_its_demonstration(database: Database):
