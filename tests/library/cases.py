@@ -26,6 +26,7 @@ from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.perform import perform_job
 from skills.library.plans.plans import plan_sutures
+from skills.library.policies import releases
 from skills.library.policies.training import request_training
 from skills.library.recordings.demos import upload_demo
 from skills.library.recordings.recordings import Upload
@@ -107,6 +108,12 @@ def trained(database: Database, data: bytes | None = None, **asked: Any) -> Poli
     """Store one demonstration and train from it; return the version."""
     add_demo(database, data)
     return train(database, **asked)
+
+
+def release(database: Database, version: PolicyVersion, **how: Any) -> None:
+    """Release a version."""
+    with database.writing() as session:
+        releases.release(session, session.merge(version), "test", **how)
 
 
 def ask_training(database: Database, surgeon: str = "kestrel", **asked: Any) -> Job:

@@ -14,7 +14,6 @@ from skills.learning.certificate import Coverage, NearLimits, NearStarts, certif
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library.operation.integrity import covered, learnt
-from skills.library.policies import releases
 from skills.library.policies.gate import GateLimits, refusals
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import request_training
@@ -34,7 +33,6 @@ def loop() -> bytes:
 
 
 def test_a_loop_that_ends_beside_its_start_is_refused_with_the_remedy(database):
-    cases.add_surgeon(database)
     version = cases.trained(database, loop())
     certificate = version.manifest.grid_certificate
     assert certificate.near == NearStarts(radius_mm=3.0, least_share=0.4, starts=7, share=0.0)
@@ -42,13 +40,12 @@ def test_a_loop_that_ends_beside_its_start_is_refused_with_the_remedy(database):
     reason = refused.text
     assert reason.startswith("of 7 starts within 3 mm of the demonstrated one, one follows only 0% of the demonstr")
     assert "train with a joining rule such as --join 0.5" in reason
-    with database.writing() as session, pytest.raises(Conflict, match=r"--join 0\.5"):
-        releases.release(session, session.merge(version), "test")
+    with pytest.raises(Conflict, match=r"--join 0\.5"):
+        cases.release(database, version)
     mended = cases.train(database, learner=HALF)
     assert mended.manifest.grid_certificate.refused_because == ()
     assert mended.manifest.grid_certificate.near.share >= 0.5
-    with database.writing() as session:
-        releases.release(session, session.merge(mended), "test")
+    cases.release(database, mended)
 
 
 @pytest.mark.parametrize(("share", "refused"), [(0.4, False), (0.39, True), (nan, True)])
@@ -60,7 +57,6 @@ def test_the_gate_refuses_a_near_start_below_its_limit_and_nan(share, refused):
 
 
 def test_the_gates_limit_is_a_setting_and_part_of_a_trainings_identity(database):
-    cases.add_surgeon(database)
     refused = cases.trained(database, loop())
     with database.writing() as session:
         asked = TrainingIn(surgeon="kestrel", suture=cases.SUTURE)
@@ -72,7 +68,6 @@ def test_the_gates_limit_is_a_setting_and_part_of_a_trainings_identity(database)
 
 
 def test_a_batch_of_stale_styles_takes_those_checked_by_other_near_limits(database):
-    cases.add_surgeon(database)
     cases.trained(database, loop())
     asked = RetrainingIn(surgeon="kestrel", only_stale=True)
     for near, stale in ((NearLimits(), []), (NearLimits(3.0, 0.0), [["other limits at the near starts"]])):
@@ -85,7 +80,6 @@ def test_the_default_of_the_settings_is_that_of_the_gate():
 
 
 def test_a_manifest_states_shares_and_by_another_rule_a_table(database):
-    cases.add_surgeon(database)
     cases.add_demo(database)
     nearest, half = cases.train(database), cases.train(database, learner=HALF)
     for version in (nearest, half):
@@ -105,7 +99,6 @@ def test_a_manifest_states_shares_and_by_another_rule_a_table(database):
 
 
 def test_a_batch_keeps_the_rule_of_each_style_unless_it_names_a_learner(database):
-    cases.add_surgeon(database)
     cases.add_surgeon(database, "osprey")
     cases.add_demo(database)
     cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)), "osprey")

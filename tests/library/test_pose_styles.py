@@ -107,7 +107,6 @@ def rows_of(database: Database) -> list[Any]:
 
 
 def test_a_training_stores_the_poses_of_its_demonstration(database: Database):
-    cases.add_surgeon(database)
     demo = add(database, turning())
     version = cases.train(database)
     with database.reading() as session:
@@ -124,7 +123,6 @@ def test_a_training_stores_the_poses_of_its_demonstration(database: Database):
 
 
 def test_several_demonstrations_give_one_pose_style_at_one_place(database: Database):
-    cases.add_surgeon(database)
     demos = [add(database, turning(shift)) for shift in (0.0, 2.5, 1.0)]
     version = cases.train(database, demos=[one.sha256 for one in demos])
     with database.reading() as session:
@@ -137,14 +135,12 @@ def test_several_demonstrations_give_one_pose_style_at_one_place(database: Datab
 
 
 def test_a_batch_stores_pose_styles_too(database: Database):
-    cases.add_surgeon(database)
     add(database, turning())
     assert retrain(database, release=True).state == "succeeded"
     assert stored(database) == 1
 
 
 def test_a_demonstration_without_orientation_has_no_pose_style(database: Database):
-    cases.add_surgeon(database)
     version = cases.trained(database, release=True)
     with database.reading() as session, pytest.raises(NotFound, match="has no orientation") as refused:
         poses_of(session.get_one(PolicyVersion, version.row))
@@ -153,7 +149,6 @@ def test_a_demonstration_without_orientation_has_no_pose_style(database: Databas
 
 
 def test_a_motion_too_quick_for_its_tube_is_not_served(database: Database):
-    cases.add_surgeon(database)
     tip = cases.points_mm()
     add(database, turning(tip=np.concatenate([tip[:20], tip[58:]])))  # across the grid between two samples
     version = cases.train(database, release=True)
@@ -163,7 +158,6 @@ def test_a_motion_too_quick_for_its_tube_is_not_served(database: Database):
 
 
 def test_a_pose_style_is_erased_with_its_demonstration(database: Database):
-    cases.add_surgeon(database)
     demo = add(database, turning())
     cases.train(database)
     assert stored(database) == 1
@@ -176,7 +170,6 @@ def test_a_pose_style_is_erased_with_its_demonstration(database: Database):
 
 def test_the_other_arm_is_stored_as_it_was_demonstrated(database: Database):
     """By hand: phase k of 100 is k hundredths of the straight way from 45 to 17 mm along x."""
-    cases.add_surgeon(database)
     add_both(database)
     other = beside(database, cases.train(database))
     assert other is not None and other.arm == "PSM1"
@@ -187,7 +180,6 @@ def test_the_other_arm_is_stored_as_it_was_demonstrated(database: Database):
 
 
 def test_a_demonstration_moved_as_a_whole_moves_the_other_arm(database: Database):
-    cases.add_surgeon(database)
     demos = [add_both(database, shift) for shift in (0.0, 3.5)]
     here, there = (beside(database, cases.train(database, demos=[demo.sha256])) for demo in demos)
     assert here is not None and there is not None
@@ -197,7 +189,6 @@ def test_a_demonstration_moved_as_a_whole_moves_the_other_arm(database: Database
 
 @pytest.mark.parametrize("without", [{"other": None}, {"other_s": 0.5}, {"other": "PSM3"}])
 def test_the_other_arm_is_learnt_if_every_recording_has_it_all_along(database: Database, without: dict[str, Any]):
-    cases.add_surgeon(database)
     has = [add_both(database, shift) for shift in (0.0, 2.5)]
     has_not = add(database, turning(1.0, **{"other": "PSM1"} | without), arm="PSM2", segment="whole")
     both = cases.train(database, demos=[one.sha256 for one in has], combine="corridor")
@@ -209,7 +200,6 @@ def test_the_other_arm_is_learnt_if_every_recording_has_it_all_along(database: D
 
 
 def test_a_batch_learns_the_other_arm_too(database: Database):
-    cases.add_surgeon(database)
     add_both(database)
     assert retrain(database, release=True).state == "succeeded"
     with database.reading() as session:
@@ -220,7 +210,6 @@ def test_a_batch_learns_the_other_arm_too(database: Database):
 def test_a_batch_tries_a_style_again_whose_recording_cannot_be_read_now(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ):
-    cases.add_surgeon(database)
     add_both(database)
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
@@ -238,7 +227,6 @@ def busy(*_: Any) -> None:
 
 
 def test_a_recording_that_is_not_cached_is_read_again(database: Database):
-    cases.add_surgeon(database)
     add_both(database)
     cached = beside(database, cases.train(database))
     with database.writing() as session:
@@ -250,14 +238,12 @@ def test_a_recording_that_is_not_cached_is_read_again(database: Database):
 
 
 def test_no_recording_is_read_where_the_other_arm_is_not_known(database: Database, monkeypatch: pytest.MonkeyPatch):
-    cases.add_surgeon(database)
     add(database, turning())
     monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     assert beside(database, cases.train(database)) is None
 
 
 def test_no_recording_is_read_without_consent(database: Database, monkeypatch: pytest.MonkeyPatch):
-    cases.add_surgeon(database)
     add_both(database)
     job = cases.ask_training(database)
     cases.committed(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
@@ -267,7 +253,6 @@ def test_no_recording_is_read_without_consent(database: Database, monkeypatch: p
 
 
 def test_a_recording_that_was_erased_meanwhile_is_named(database: Database):
-    cases.add_surgeon(database)
     demo = add_both(database)
     with database.reading() as session:
         read = training.lessons(session, [demo.row])
@@ -278,7 +263,6 @@ def test_a_recording_that_was_erased_meanwhile_is_named(database: Database):
 
 @pytest.mark.nightly  # by day tests/library/test_backup.py counts every table
 def test_a_backup_holds_the_pose_styles(database: Database, tmp_path: Path):
-    cases.add_surgeon(database)
     add(database, turning())
     cases.train(database)
     back_up(database, tmp_path / "all.zip")
@@ -293,7 +277,6 @@ def test_a_backup_holds_the_pose_styles(database: Database, tmp_path: Path):
 
 @pytest.mark.parametrize("changed", ["sha256 = 'e' || substr(sha256, 2)", "policy_row = 1"])
 def test_a_changed_pose_style_is_refused_and_found(database: Database, changed: str):
-    cases.add_surgeon(database)
     cases.trained(database)
     demo = add(database, turning(2.5))
     version = cases.train(database, demos=[demo.sha256])
