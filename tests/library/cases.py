@@ -1,12 +1,12 @@
 """Small hand-offs as tables and bags, and their way to a playback, with the library calls that the service makes."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from itertools import pairwise
 from threading import Event
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from sqlalchemy import select
@@ -20,11 +20,13 @@ from skills.formats import write_mcap
 from skills.jobs.workflows import Work
 from skills.learning.policy import describe_learner
 from skills.learning.q_learning import CellQLearning
+from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.jobs import BATCH
 from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.perform import perform_job
 from skills.library.plans.plans import plan_sutures
+from skills.library.policies import releases
 from skills.library.policies.training import request_training
 from skills.library.recordings.demos import upload_demo
 from skills.library.recordings.recordings import Upload
@@ -34,6 +36,8 @@ from skills.schemas.people import SurgeonIn
 from skills.schemas.plans import PlanIn
 from skills.schemas.training import TrainingIn
 from skills.settings import Settings
+
+T = TypeVar("T")
 
 SUTURE = "simple-running"
 PUBLISHED = CellQLearning.published()
@@ -79,6 +83,12 @@ def add_surgeon(database: Database, slug: str = "kestrel", **about: Any) -> None
         put_surgeon(session, slug, SurgeonIn.model_validate(about), "test")
 
 
+def committed(database: Database, change: Callable[..., T], *asked: Any) -> T:
+    """Call a use case in a transaction of its own."""
+    with database.writing() as session:
+        return change(session, *asked)
+
+
 def agree(session: Session, consent: Any, surgeon: str = "kestrel") -> None:
     """Record a surgeon's consent, and nothing else of the surgeon."""
     put_surgeon(session, surgeon, SurgeonIn(consent=consent), "test")
@@ -92,6 +102,18 @@ def add_demo(database: Database, data: bytes | None = None, surgeon: str = "kest
 def store(database: Database, sent: Upload, surgeon: str = "kestrel", **cut: Any) -> Demonstration:
     """Store one demonstration of an upload, and return its row."""
     return upload_demo(database, sent, DemoIn(surgeon=surgeon, suture=SUTURE, **cut), "test").row
+
+
+def trained(database: Database, data: bytes | None = None, **asked: Any) -> PolicyVersion:
+    """Store one demonstration and train from it; return the version."""
+    add_demo(database, data)
+    return train(database, **asked)
+
+
+def release(database: Database, version: PolicyVersion, **how: Any) -> None:
+    """Release a version."""
+    with database.writing() as session:
+        releases.release(session, session.merge(version), "test", **how)
 
 
 def ask_training(database: Database, surgeon: str = "kestrel", **asked: Any) -> Job:
@@ -157,3 +179,9 @@ def add_plan(database: Database, surgeon: str = "kestrel", **asked: Any) -> Plan
         PlanIn(surgeon=surgeon, suture=SUTURE, suture_points=[{"position_mm": (5.0, 55.0, -125.0)}], **asked),
         "test",
     )[0]
+
+
+def wrong(database: Database) -> list[tuple[str, str]]:
+    """Inspect everything that is stored, as `skills verify` does, and return the faults."""
+    parts = {part.what: part for part in inspect_installation(database)}
+    return [one for part in parts.values() for one in part.wrong]

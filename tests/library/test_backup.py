@@ -19,7 +19,7 @@ from skills.library.operation.erasure_list import Erasures, erasures_of, keep_er
 from skills.library.operation.inspection import inspect_installation
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
-from skills.library.policies.versions import policy_of
+from skills.library.policies.versions import served_release
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
 from tests import backends
@@ -247,7 +247,7 @@ def test_who_was_erased_after_the_backup_does_not_come_back(
     without = empty("sqlite")
     restore(without, tmp_path / "b.zip")
     with without.reading() as session:
-        assert policy_of(session, canary, cases.SUTURE).policy.releasable
+        assert served_release(session, canary, cases.SUTURE).policy.releasable
 
 
 def test_a_demo_erased_and_added_again_before_the_backup_is_not_erased(

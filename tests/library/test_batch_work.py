@@ -1,18 +1,20 @@
 """Parts of batches: each style is trained independently and once, even if several workers work on it."""
 
 import time
+from collections.abc import Callable
 from threading import Thread
 
 import pytest
 from sqlalchemy import func, select
 
-from skills.db.service_tables import Event
+from skills.db.service_tables import Event, Job
 from skills.db.session import Database
 from skills.jobs.workflows import Work, fail, start
 from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job
 from skills.library.policies import batches, retraining
-from skills.library.policies.learning import learn_style
+from skills.library.policies.learning import Learnt, Lesson, learn_style
+from skills.library.policies.requests import TrainingRequest
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
@@ -28,6 +30,37 @@ from tests.library.styles import (
     states_of,
     styles_of,
 )
+
+Before = Callable[[Callable[[Lesson], object]], None]
+
+
+@pytest.fixture
+def in_one_part(database: Database, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], tuple[Job, Job]]:
+    """Return a function that adds styles and requests a batch of a single part; it returns the batch and the part."""
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+
+    def request(number: int) -> tuple[Job, Job]:
+        add_styles(database, number)
+        job = ask_retraining(database)
+        (part,) = parts_of(database, job)
+        return job, part
+
+    return request
+
+
+@pytest.fixture
+def before_learning(monkeypatch: pytest.MonkeyPatch) -> Before:
+    """Return a function that sets what is done before a style is learnt."""
+
+    def before(step: Callable[[Lesson], object]) -> None:
+        def learn(lesson: Lesson, request: TrainingRequest, settings: Settings) -> Learnt:
+            step(lesson)
+            return learn_style(lesson, request, settings)
+
+        monkeypatch.setattr(batches, "learn_style", learn)
+
+    return before
+
 
 # ---- one bad style
 
@@ -70,22 +103,18 @@ def test_styles_without_consent_or_valid_demo_fail_and_the_others_continue(datab
 
 
 def test_an_internal_failure_is_retried_and_then_only_its_style_gives_up(
-    database: Database, monkeypatch: pytest.MonkeyPatch
+    database: Database, in_one_part, before_learning
 ):
-    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
-    add_styles(database, 5)
-    job = ask_retraining(database)
-    (part,) = parts_of(database, job)
+    job, part = in_one_part(5)
     bad = styles_of(database, job)[1].demonstration_row
     learnt = []
 
-    def learn(lesson, request, settings):
+    def step(lesson: Lesson) -> None:
         learnt.append(lesson.row)
         if lesson.row == bad:
             raise RuntimeError("/srv/secret")
-        return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batches, "learn_style", learn)
+    before_learning(step)
     work = Work(database, Settings(database_url=database.url), perform_job)
     assert not work.try_once(part.row, 1, 0)
     assert states_of(database, job) == ["done", "queued", "done", "done", "done"]
@@ -101,22 +130,18 @@ def test_an_internal_failure_is_retried_and_then_only_its_style_gives_up(
     assert (batch.state, batch.result["done"], batch.result["failed"]) == ("failed", 4, 1)
 
 
-def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
-    add_styles(database, 4)
-    job = ask_retraining(database)
-    (part,) = parts_of(database, job)
+def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database, in_one_part, before_learning, monkeypatch):
+    job, part = in_one_part(4)
     deadly = styles_of(database, job)[1].demonstration_row
 
     class Death(BaseException):
         """An error that kills the worker."""
 
-    def learn(lesson, request, settings):
+    def step(lesson: Lesson) -> None:
         if lesson.row == deadly:
             raise Death
-        return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batches, "learn_style", learn)
+    before_learning(step)
     monkeypatch.setattr(batches, "TOGETHER_S", 60.0)  # on a slow machine too
     for done in (0, 1, 3):  # at first it rolled back the others in its transaction
         assert start(database, part.row, 1)
@@ -129,46 +154,37 @@ def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database: Dat
     assert look(database, job).state == "failed"
 
 
-def test_a_style_refused_at_commit_does_not_roll_back_the_others(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
-    add_styles(database, 3)
-    job = ask_retraining(database)
-    (part,) = parts_of(database, job)
+def test_a_style_refused_at_commit_does_not_roll_back_the_others(database: Database, in_one_part, before_learning):
+    job, part = in_one_part(3)
     withdrawn = styles_of(database, job)[1].demonstration.sha256
 
-    def learn(lesson, request, settings):
+    def step(lesson: Lesson) -> None:
         if lesson.sha256 == withdrawn:
-            with database.writing() as session:
-                withdraw_demo(session, withdrawn, "test")
-        return learn_style(lesson, request, settings)
+            cases.committed(database, withdraw_demo, withdrawn, "test")
 
-    monkeypatch.setattr(batches, "learn_style", learn)
+    before_learning(step)
     cases.work(database, part)
     assert states_of(database, job) == ["done", "failed", "done"]
     assert "withdrawn while the training used it" in styles_of(database, job)[1].reason
     assert count_versions(database) == 2
 
 
-def test_what_takes_long_is_committed_alone(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+def test_what_takes_long_is_committed_alone(database, in_one_part, before_learning, monkeypatch):
     monkeypatch.setattr(batches, "TOGETHER_S", 0.0)
-    add_styles(database, 3)
-    job = ask_retraining(database)
-    (part,) = parts_of(database, job)
+    job, part = in_one_part(3)
     seen = []
 
-    def learn(lesson, request, settings):
+    def step(lesson: Lesson) -> None:
         seen.append((states_of(database, job).count("done"), look(database, job).progress))
-        return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batches, "learn_style", learn)
+    before_learning(step)
     cases.work(database, part)
     assert [done for done, _ in seen] == [0, 1, 2]
     assert [round(progress, 6) for _, progress in seen] == [0.0, round(1 / 3, 6), round(2 / 3, 6)]
 
 
 def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
-    database: Database, monkeypatch: pytest.MonkeyPatch
+    database: Database, before_learning, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 2)
     add_styles(database, 6)
@@ -176,12 +192,11 @@ def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
     parts = {style.demonstration_row: style.part_row for style in styles_of(database, job)}
     learnt = []
 
-    def learn(lesson, request, settings):
+    def step(lesson: Lesson) -> None:
         learnt.append(parts[lesson.row])
         time.sleep(0.02)  # long enough for the other thread to intervene
-        return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batches, "learn_style", learn)
+    before_learning(step)
     both = [Thread(target=cases.work, args=(database, part)) for part in parts_of(database, job)]
     for thread in both:
         thread.start()
@@ -195,24 +210,20 @@ def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
 
 
 def test_a_late_result_changes_nothing_and_its_worker_does_what_is_left(
-    database: Database, monkeypatch: pytest.MonkeyPatch
+    database, in_one_part, before_learning, monkeypatch
 ):
-    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
-    add_styles(database, 3)
-    job = ask_retraining(database)
-    (part,) = parts_of(database, job)
+    job, part = in_one_part(3)
     others, ended = [], []
 
-    def learn(lesson, request, settings):
+    def step(lesson: Lesson) -> None:
         if not others:  # meanwhile another worker takes the part over, and finishes it
             others.append(lesson.row)
             with monkeypatch.context() as meanwhile:
                 meanwhile.setattr(batches, "learn_style", learn_style)
                 perform_job(database, part.row, 1, Settings(database_url=database.url))
             ended.append(look(database, job).ended_at)
-        return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batches, "learn_style", learn)
+    before_learning(step)
     cases.work(database, part)
     assert states_of(database, job) == ["done"] * 3
     assert (count_versions(database), look(database, job).state) == (3, "succeeded")

@@ -54,7 +54,7 @@ def served(database: Database) -> int | None:
         assert (shown.style.state == "released", shown.served is not None) == (bool(listed), bool(listed))
         assert len(styles.matrix(session, state="released").rows) == len(listed)
         try:
-            version = versions.policy_of(session, "kestrel", SUTURE).policy.version
+            version = versions.served_release(session, "kestrel", SUTURE).policy.version
         except NotFound:
             assert listed == []
             return None
@@ -167,7 +167,7 @@ def test_a_release_asks(database: Database):
     with database.writing() as session:
         releases.release(session, versions.find_version(session, "kestrel", SUTURE, 1), "anna")
     with database.reading() as session:
-        assert versions.policy_of(session, "kestrel", SUTURE).policy.version == 1
+        assert versions.served_release(session, "kestrel", SUTURE).policy.version == 1
 
 
 def test_who_takes_consent_back_while_an_atlas_is_measured_is_not_in_it(
@@ -218,7 +218,7 @@ def test_withdrawn_consent_withdraws_releases_and_renewal_restores_none(
         withdrawn = select(Event).where(Event.action == "withdraw", Event.object_kind == "policy-version")
         assert [one.actor for one in session.scalars(withdrawn)] == ["anna", "anna"]
         with pytest.raises(NotFound, match=r"is served\. The consent of 'kestrel' does not cover training"):
-            versions.policy_of(session, "kestrel", SUTURE)
+            versions.served_release(session, "kestrel", SUTURE)
     agree(database, ALL)
     assert served(database) is None
     with database.writing() as session:
@@ -234,7 +234,7 @@ def test_consent_serves_to_the_end_of_its_last_day_and_no_longer(database: Datab
     monkeypatch.setattr(consent, "today", lambda: TODAY + timedelta(days=1))
     assert served(database) is None
     with database.reading() as session, pytest.raises(NotFound, match=f"expired on {TODAY}"):
-        versions.policy_of(session, "kestrel", SUTURE)
+        versions.served_release(session, "kestrel", SUTURE)
     with database.writing() as session, pytest.raises(Conflict, match=f"expired on {TODAY}"):
         releases.release(session, versions.find_version(session, "kestrel", SUTURE, version.version), "anna")
     with pytest.raises(Conflict, match=f"expired on {TODAY}"):

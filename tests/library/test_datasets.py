@@ -26,7 +26,7 @@ from skills.library.people import consent
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.perform import perform_job
-from skills.library.recordings.datasets import delete_dataset, export_dataset, find_dataset
+from skills.library.recordings.datasets import DatasetRequest, delete_dataset, export_dataset, find_dataset
 from skills.library.recordings.demos import mark_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
 from skills.schemas.people import SurgeonIn
@@ -263,10 +263,10 @@ def test_a_second_attempt_writes_the_same_bytes(database: Database):
     add(database, session_of())
     job = ask(database)
     running(database, job)
-    cut_short = export_dataset(database, job.request, Settings())
+    cut_short = export_dataset(database, DatasetRequest.model_validate(job.request), Settings())
     assert kept(database) == (0, 0, 1)
     with database.writing() as session:
-        digest = cut_short(session, "test")["dataset"]
+        digest = cut_short(session, "test").dataset
         session.rollback()
     assert kept(database) == (0, 0, 1)
     assert cases.work(database, job).result["dataset"] == digest

@@ -29,7 +29,8 @@ from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies import releases
-from skills.library.policies.versions import policy_of
+from skills.library.policies.requests import TrainingRequest
+from skills.library.policies.versions import served_release
 from skills.library.recordings.demos import add_demo, find_demo, withdraw_demo
 from skills.library.recordings.recordings import recording_bytes, store_recording
 from skills.schemas.demos import DemoIn
@@ -169,14 +170,14 @@ def test_the_same_training_gives_the_same_digest_in_any_database(database: Datab
 
 def interrupted(monkeypatch: pytest.MonkeyPatch, meanwhile: Callable[[], None]) -> None:
     """Run a callback after the learning and before its result is stored."""
-    train = library.MAKERS["training"]
+    train = library.PERFORMERS[TrainingRequest]
 
     def make(*asked: Any) -> Any:
         store = train(*asked)
         meanwhile()
         return store
 
-    monkeypatch.setitem(library.MAKERS, "training", make)
+    monkeypatch.setitem(library.PERFORMERS, TrainingRequest, make)
 
 
 def test_a_job_cancelled_while_it_learns_leaves_no_policy(database: Database, monkeypatch: pytest.MonkeyPatch):
@@ -224,8 +225,7 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
 
 
 def test_erasure_leaves_no_row_and_events_without_a_name(database: Database):
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     cases.add_plan(database)
     with database.writing() as session:
         subject = find_surgeon(session, "kestrel").subject
@@ -255,14 +255,13 @@ def test_what_was_released_is_what_was_learnt(database: Database):
     demo = cases.add_demo(database)
     version = cases.train(database, release=True)
     with database.reading() as session:
-        served = policy_of(session, "kestrel", cases.SUTURE)
+        served = served_release(session, "kestrel", cases.SUTURE)
         assert served.policy.sha256 == version.sha256
         assert learnt(served.policy).path.states.tolist() == find_demo(session, demo.sha256).path.states.tolist()
 
 
 def test_the_first_page_shows_what_the_manifest_states(database: Database):
-    cases.add_demo(database)
-    cases.train(database)
+    cases.trained(database)
     with database.reading() as session:
         manifest = session.scalars(select(PolicyVersion.manifest)).one()
         assert tile(session) == (manifest.waypoints, pytest.approx(manifest.coverage.mean_share))
@@ -278,20 +277,18 @@ def tile(session: Session) -> tuple[list[int], float]:
 
 
 def test_what_value_iteration_finds_may_be_released(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=ValueIteration())
+    version = cases.trained(database, learner=ValueIteration())
     assert version.releasable
     assert version.manifest.learner == "value-iteration"
     assert version.manifest.metrics.dtw_total_mm == 0
     with database.writing() as session:
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
     with database.reading() as session:
-        assert policy_of(session, "kestrel", cases.SUTURE).policy.row == version.row
+        assert served_release(session, "kestrel", cases.SUTURE).policy.row == version.row
 
 
 def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=MaxEntIRL(iterations=30))
+    version = cases.trained(database, learner=MaxEntIRL(iterations=30))
     with database.writing() as session:
         kept = session.get_one(PolicyVersion, version.row)
         assert learnt(kept).learner == MaxEntIRL(iterations=30)
@@ -301,8 +298,7 @@ def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: D
 
 
 def test_a_failing_version_is_not_released_whatever_its_row_says(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=cases.PUBLISHED)
+    version = cases.trained(database, learner=cases.PUBLISHED)
     with database.writing() as session, pytest.raises(Conflict, match="do not reach the goal"):
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
     assert "releases" not in counts(database)

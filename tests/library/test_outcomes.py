@@ -17,12 +17,12 @@ from skills.library import perform as library
 from skills.library.comparison.scores import LEAST_DEMOS, score
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import keep_erasures, read_erasures
-from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
 from skills.library.policies.gate import remedy
 from skills.library.policies.releases import in_force, release
+from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256
@@ -32,6 +32,7 @@ from skills.schemas.policies import GateRefusal
 from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
+from tests.library.cases import wrong
 from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, styles_of
 
 WHY = "The needle fell."
@@ -57,10 +58,6 @@ def served(database: Database) -> list[int]:
 def release_again(database: Database, version: PolicyVersion) -> None:
     with database.writing() as session:
         release(session, find_by_digest(session, version.sha256), "test")
-
-
-def wrong(database: Database) -> list[tuple[str, str]]:
-    return [one for part in {id(part): part for part in inspect_installation(database)}.values() for one in part.wrong]
 
 
 def actions(database: Database) -> Sequence[tuple[str, str]]:
@@ -142,8 +139,7 @@ def test_a_mark_is_seen_with_its_surgeon_and_goes_with_its_demonstration(databas
     with database.seen_by(Only("somebody", frozenset({mine.surgeon_row}))).reading() as session:
         assert session.scalars(select(DemonstrationOutcome.demonstration_row)).all() == [mine.row]
         assert [one.outcome for one in list_demos(session, 10, None, None, None)] == ["failure"]
-    with database.writing() as session:
-        erase_demo(session, mine.sha256, "test")
+    cases.committed(database, erase_demo, mine.sha256, "test")
     assert counted(database, DemonstrationOutcome) == 1
     assert wrong(database) == []
 
@@ -285,14 +281,14 @@ def test_a_mark_made_while_a_style_is_learnt(
     database: Database, monkeypatch: pytest.MonkeyPatch, outcomes: str, made: int
 ):
     demo = add(database)
-    train = library.MAKERS["training"]
+    train = library.PERFORMERS[TrainingRequest]
 
     def make(*asked: object) -> object:
         store = train(*asked)
         mark(database, demo, "failure")
         return store
 
-    monkeypatch.setitem(library.MAKERS, "training", make)
+    monkeypatch.setitem(library.PERFORMERS, TrainingRequest, make)
     job = cases.work(database, cases.ask_training(database, release=True, outcomes=outcomes))
     assert job.state == ("succeeded" if made else "failed")
     if not made:

@@ -1,7 +1,7 @@
 """`skills verify --relearn`: certificates and policies computed again agree, and consistent changes are named."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import NotFound
 from skills.formats.parsed import parse_recording
-from skills.learning.certificate import NearLimits
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNER_VERSION
@@ -26,6 +25,7 @@ from skills.library.operation.integrity import demo_identity, poses_identity_of
 from skills.library.policies.gate import GATE_VERSION
 from skills.library.policies.learning import certified, lessons
 from skills.library.policies.relearning import compute_again, decoded
+from skills.library.policies.requests import request_of
 from skills.library.recordings.demos import mark_demo
 from skills.schemas.policies import PolicyManifest
 from skills.settings import Settings
@@ -56,8 +56,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cases.train(database, learner=cases.PUBLISHED)
     cases.train(database, scene=SCENE.as_json(), learner=SLIPPING)
     cases.train(database, learner=ValueIteration(), combine="corridor", **two)
-    with database.writing() as session:
-        mark_demo(session, demos[1].sha256, "recovery", None, "test")
+    cases.committed(database, mark_demo, demos[1].sha256, "recovery", None, "test")
     cases.train(database, outcomes="any", combine="corridor", **two)
     with database.writing() as session:  # not as when it was learnt from
         mark_demo(session, demos[2].sha256, "failure", None, "test")
@@ -132,7 +131,7 @@ def test_other_actions_with_certificate_and_digests_are_named(database):
     q = policy.q.copy()
     q[policy.domain.certified] *= 1.0 + 1e-12
     forged = replace(policy, q=q)
-    made = certified(lesson, {**_request(manifest), "release": False}, demo, forged)
+    made = certified(lesson, request_of(manifest), demo, forged)
     rewritten(database, 1, forged, made.manifest)
     with tampering(database) as connection:
         connection.execute(
@@ -171,11 +170,6 @@ def test_another_motion_of_the_other_arm_with_its_digest_is_named(tmp_path: Path
     ((name, why),) = parts(database)[RELEARNT].wrong
     assert name == "policy_versions 1" and why.endswith("the other arm's motion in its pose style")
     database.close()
-
-
-def _request(manifest: PolicyManifest) -> dict[str, Any]:
-    names = ("surgeon", "suture", "demos", "seed", "learner_version")
-    return {name: getattr(manifest, name) for name in names} | {"gate": GATE_VERSION, "near": asdict(NearLimits())}
 
 
 def test_a_demonstration_other_than_its_recording_is_named(database):
@@ -240,8 +234,7 @@ def test_what_was_erased_meanwhile_is_not_called_wrong(database, monkeypatch):
 
 
 def test_without_consent_nothing_is_learnt_again(database):
-    with database.writing() as session:
-        cases.agree(session, {"uses": []})
+    cases.committed(database, cases.agree, {"uses": []})
     part = parts(database)[RELEARNT]
     assert part.wrong == []
     assert len(part.left_out) == 6

@@ -23,7 +23,7 @@ from skills.library.people.erasure import delete_recording, erase_demo, erase_su
 from skills.library.people.keys import create_key, revoke_key
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import release, withdraw
-from skills.library.policies.versions import policy_of
+from skills.library.policies.versions import served_release
 from skills.library.recordings.demos import mark_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
 from skills.schemas.people import Consent, SurgeonIn
@@ -56,7 +56,7 @@ def restored(database: Database, tmp_path: Path) -> Iterator[Callable[[], Databa
 def served(database: Database) -> str | None:
     with database.reading() as session:
         try:
-            return policy_of(session, "kestrel", cases.SUTURE).policy.sha256
+            return served_release(session, "kestrel", cases.SUTURE).policy.sha256
         except NotFound:
             return None
 

@@ -50,7 +50,7 @@ from skills.library.comparison.calibrations import read_calibration
 from skills.library.operation.history import Verified, verify_history
 from skills.library.operation.integrity import covered, demo_identity, planned, posed
 from skills.library.operation.jobs import identity_of
-from skills.library.policies.combined import path_of
+from skills.library.policies.combined import learnt_from
 from skills.library.policies.pose_styles import poses_of_demonstrations
 from skills.library.policies.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
 from skills.library.recordings.content_cache import alike, cached_content, read_entry
@@ -425,7 +425,7 @@ def _policy(row: PolicyVersion) -> Why:
         yield "it was learnt from another demonstration"
     if any((one.surgeon_row, one.suture) != (row.surgeon_row, row.suture) for one in demonstrations):
         yield "its demonstration is of another style"
-    if digest(row.learnt.path) != digest(path_of(row)):
+    if digest(row.learnt.path) != digest(learnt_from(row).path):
         yield "its path differs from that of its demonstration"
 
 
