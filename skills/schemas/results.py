@@ -4,7 +4,8 @@
 of a training is in `training`.
 """
 
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Self
 
 from skills.fields import Sha256
 from skills.schemas import Given
@@ -61,6 +62,6 @@ class ProposedSegments(Given):
     segments: tuple[NumberedSegment, ...]
 
     @classmethod
-    def of(cls, numbers: dict[str, Any]) -> Self:
+    def of(cls, numbers: Mapping[str, object]) -> Self:
         """Return the proposals that the numbers of a refusal list."""
         return cls.model_validate(numbers)
