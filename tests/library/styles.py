@@ -81,7 +81,11 @@ def states_of(database: Database, job: Job) -> list[str]:
 
 def retrain(database: Database, **asked: object) -> Job:
     """Request a batch and carry out all of its parts, as a worker does."""
-    job = ask_retraining(database, **asked)
+    return finish(database, ask_retraining(database, **asked))
+
+
+def finish(database: Database, job: Job) -> Job:
+    """Carry out all parts of a batch; return its job."""
     for part in parts_of(database, job):
         cases.work(database, part)
     return look(database, job)

@@ -32,7 +32,7 @@ from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
 from tests.library.cases import wrong
-from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, served, styles_of
+from tests.library.styles import ask_retraining, counted, finish, look, retrain, served, styles_of
 
 WHY = "The needle fell."
 FAILED = pytest.mark.parametrize("outcome", ["recovery", "failure"])
@@ -300,8 +300,7 @@ def test_a_mark_made_before_a_batch_learns_fails_its_style(database: Database):
     demo = add(database)
     job = ask_retraining(database, release=True)
     mark(database, demo, "failure")
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     (style,) = styles_of(database, job)
     assert (style.state, style.reason.split(" while ")[0]) == ("failed", "A demonstration was marked failure")
     assert (look(database, job).state, counted(database, PolicyVersion)) == ("failed", 0)
@@ -314,8 +313,7 @@ def test_a_batch_whose_demonstrations_have_all_been_marked_says_so(database: Dat
     for demo in demos:
         mark(database, demo, "failure")
     assert served(database) == [1]
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     (style,) = styles_of(database, job)
     assert style.state == "failed" and "withdrawn or marked since" in style.reason
 
