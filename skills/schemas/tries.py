@@ -5,7 +5,7 @@ request again with them applies it. A client needs to know no more: a page makes
 command.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue, StrictBool
 

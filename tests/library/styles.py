@@ -4,7 +4,7 @@ from itertools import count, islice
 
 from sqlalchemy import func, select, text
 
-from skills.db.models import PolicyVersion, SutureType
+from skills.db.models import Demonstration, PolicyVersion, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.formats.parsed import parse_recording
@@ -12,6 +12,7 @@ from skills.learning.policy import describe_learner
 from skills.library.operation.jobs import PART
 from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
+from skills.library.policies.releases import in_force
 from skills.library.policies.retraining import request_retraining
 from skills.library.recordings import demos
 from skills.library.recordings.content_cache import entry_of
@@ -80,7 +81,11 @@ def states_of(database: Database, job: Job) -> list[str]:
 
 def retrain(database: Database, **asked: object) -> Job:
     """Request a batch and carry out all of its parts, as a worker does."""
-    job = ask_retraining(database, **asked)
+    return finish(database, ask_retraining(database, **asked))
+
+
+def finish(database: Database, job: Job) -> Job:
+    """Carry out all parts of a batch; return its job."""
     for part in parts_of(database, job):
         cases.work(database, part)
     return look(database, job)
@@ -107,3 +112,10 @@ def counted(database: Database, table: type) -> int:
     """Count the rows of a table."""
     with database.reading() as session:
         return session.scalar(select(func.count()).select_from(table))
+
+
+def served(database: Database) -> list[int]:
+    """Return the versions of the releases of the only surgeon that stand, the served one first."""
+    with database.reading() as session:
+        (surgeon,) = session.scalars(select(Demonstration.surgeon_row).distinct())
+        return [one.policy.version for one in in_force(session, surgeon, cases.SUTURE)]

@@ -25,6 +25,7 @@ from tests.library.styles import (
     ask_retraining,
     count_versions,
     damage,
+    finish,
     look,
     parts_of,
     states_of,
@@ -92,8 +93,7 @@ def test_styles_without_consent_or_valid_demo_fail_and_the_others_continue(datab
         put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
         heron = cases.Demonstration.surgeon.has(slug="heron")
         withdraw_demo(session, session.scalars(select(cases.Demonstration).where(heron)).one().sha256, "test")
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     reasons = {style.demonstration.surgeon.slug: style.reason for style in styles_of(database, job)}
     assert reasons["surgeon-0"] is None
     assert "does not cover training" in reasons["kestrel"]

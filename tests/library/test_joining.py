@@ -20,7 +20,7 @@ from skills.library.policies.training import request_training
 from skills.schemas.training import RetrainingIn, TrainingIn
 from skills.settings import Settings
 from tests.library import cases
-from tests.library.styles import ask_retraining, parts_of, styles_of
+from tests.library.styles import ask_retraining, finish, styles_of
 
 HALF = PhaseQLearning(join_share=0.5)
 # A loop that ends in the cell beside its start, so that the starts on the other side of its end join there.
@@ -116,11 +116,6 @@ def test_a_batch_keeps_the_rule_of_each_style_unless_it_names_a_learner(database
     assert style.policy.manifest.settings["join_share"] == 0
     assert any("of the demonstration on average" in why for why in style.comparison.worse_because)
     assert not style.comparison.now_released
-
-
-def finish(database, job):
-    for part in parts_of(database, job):
-        cases.work(database, part)
 
 
 @pytest.mark.parametrize("learner", [PhaseQLearning(), CellQLearning()])

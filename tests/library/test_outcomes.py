@@ -21,7 +21,6 @@ from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
 from skills.library.policies.gate import remedy
-from skills.library.policies.releases import in_force, release
 from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
@@ -33,7 +32,7 @@ from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
 from tests.library.cases import wrong
-from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, styles_of
+from tests.library.styles import ask_retraining, counted, finish, look, retrain, served, styles_of
 
 WHY = "The needle fell."
 FAILED = pytest.mark.parametrize("outcome", ["recovery", "failure"])
@@ -46,18 +45,6 @@ def add(database: Database, shift_mm: float = 0.0, **cut: object) -> Demonstrati
 def mark(database: Database, demo: Demonstration, outcome: str, reason: str | None = WHY) -> Demonstration:
     with database.writing() as session:
         return mark_demo(session, demo.sha256, outcome, reason, "test")
-
-
-def served(database: Database) -> list[int]:
-    """Return the versions of all releases that stand, the newest first."""
-    with database.reading() as session:
-        (surgeon,) = session.scalars(select(Demonstration.surgeon_row).distinct())
-        return [one.policy.version for one in in_force(session, surgeon, cases.SUTURE)]
-
-
-def release_again(database: Database, version: PolicyVersion) -> None:
-    with database.writing() as session:
-        release(session, find_by_digest(session, version.sha256), "test")
 
 
 def actions(database: Database) -> Sequence[tuple[str, str]]:
@@ -235,13 +222,13 @@ def test_a_mark_withdraws_the_releases_that_rest_on_it(database: Database, outco
     mark(database, demo, outcome)
     assert served(database) == []  # the one before does not come back by itself
     with pytest.raises(Conflict, match=f"its demonstration was marked {outcome}") as refused:
-        release_again(database, version)
+        cases.release(database, version)
     assert "was marked" in refused.value.message
     assert remedy([GateRefusal("marked", "")]).startswith("Train from another demonstration, or with outcomes 'any'")
     assert wrong(database) == []
     mark(database, demo, "success", None)
     assert served(database) == []
-    release_again(database, version)
+    cases.release(database, version)
     assert served(database) == [2]
 
 
@@ -263,7 +250,7 @@ def test_a_policy_trained_from_any_outcome_stays_released(database: Database):
     with database.writing() as session:
         for one in session.scalars(select(Release)):
             one.withdrawn_at = one.released_at
-    release_again(database, version)
+    cases.release(database, version)
     assert served(database) == [1]
     assert wrong(database) == []
 
@@ -313,8 +300,7 @@ def test_a_mark_made_before_a_batch_learns_fails_its_style(database: Database):
     demo = add(database)
     job = ask_retraining(database, release=True)
     mark(database, demo, "failure")
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     (style,) = styles_of(database, job)
     assert (style.state, style.reason.split(" while ")[0]) == ("failed", "A demonstration was marked failure")
     assert (look(database, job).state, counted(database, PolicyVersion)) == ("failed", 0)
@@ -327,8 +313,7 @@ def test_a_batch_whose_demonstrations_have_all_been_marked_says_so(database: Dat
     for demo in demos:
         mark(database, demo, "failure")
     assert served(database) == [1]
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     (style,) = styles_of(database, job)
     assert style.state == "failed" and "withdrawn or marked since" in style.reason
 
@@ -393,7 +378,7 @@ def test_a_mark_made_after_the_backup_is_made_again(database: Database, tmp_path
             outcomes = {one.sha256: one.outcome for one in session.scalars(select(Demonstration))}
         assert outcomes == {demo.sha256: "failure", other.sha256: "recovery"}
         with pytest.raises(Conflict, match="was marked failure"):
-            release_again(after, version)
+            cases.release(after, version)
         assert wrong(after) == []
         assert "Doe" not in (tmp_path / "list.json").read_text()
     finally:

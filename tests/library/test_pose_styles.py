@@ -18,6 +18,7 @@ from skills.formats.bag_writer import write_mcap
 from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
+from skills.library.operation.inspection import HISTORY
 from skills.library.operation.jobs import PartRequest
 from skills.library.people.erasure import erase_demo
 from skills.library.people.surgeons import put_surgeon
@@ -286,6 +287,6 @@ def test_a_changed_pose_style_is_refused_and_found(database: Database, changed: 
         session.execute(text(f"UPDATE pose_styles SET {changed}"))
     with database.reading() as session, pytest.raises((Corrupt, NotFound)):
         poses_of(session.get_one(PolicyVersion, version.row))
-    ((where, why),) = wrong(database)
+    ((where, why),) = wrong(database, HISTORY)
     assert where.startswith("pose_styles") and "does not match its digest" in why
     cases.committed(database, withdraw_demo, demo.sha256, "test")

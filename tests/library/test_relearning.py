@@ -17,7 +17,7 @@ from skills.errors import NotFound
 from skills.formats.parsed import parse_recording
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
-from skills.learning.policy import LEARNER_VERSION
+from skills.learning.policy import LEARNER_VERSION, Policy
 from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation import inspection
 from skills.library.operation.inspection import Checked, inspect_policies
@@ -100,6 +100,13 @@ def test_with_a_limit_some_are_learnt_again_and_the_others_certified(database):
     }
 
 
+def stored(database: Database, row: int = 1) -> tuple[Policy, PolicyManifest]:
+    """Return a stored policy and its manifest."""
+    with database.reading() as session:
+        version = session.get_one(PolicyVersion, row)
+        return version.learnt, version.manifest
+
+
 def rewritten(database: Database, row: int, policy: Any, manifest: PolicyManifest) -> None:
     """Write a policy and a manifest with the digest of both, past the triggers."""
     value = {"learnt": policy, "manifest": manifest, "sha256": manifest.identity(digest(policy))}
@@ -109,9 +116,7 @@ def rewritten(database: Database, row: int, policy: Any, manifest: PolicyManifes
 
 
 def test_a_certificate_with_better_figures_and_its_digest_is_named(database):
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, 2)
-        policy, manifest = version.learnt, version.manifest
+    policy, manifest = stored(database, 2)
     metrics = replace(manifest.metrics, dtw_total_mm=1.5, rmse_mm=(0.5, 0.5, 0.5))
     rewritten(database, 2, policy, manifest.model_copy(update={"metrics": metrics}))
     for how in (RELEARN, None):
@@ -187,10 +192,8 @@ def test_a_demonstration_other_than_its_recording_is_named(database):
 
 
 def test_a_version_of_an_older_learner_is_never_called_whole(database):
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, 1)
-        policy, manifest = version.learnt, version.manifest.model_copy(update={"learner_version": LEARNER_VERSION - 1})
-    rewritten(database, 1, policy, manifest)
+    policy, manifest = stored(database)
+    rewritten(database, 1, policy, manifest.model_copy(update={"learner_version": LEARNER_VERSION - 1}))
     made = f"made by an older learner (version {LEARNER_VERSION - 1}, now {LEARNER_VERSION})"
     found = parts(database)
     assert found[CERTIFICATES].left_out == [("policy_versions 1", f"{made}, its certificate was not computed again")]
@@ -199,9 +202,7 @@ def test_a_version_of_an_older_learner_is_never_called_whole(database):
 
 
 def test_of_an_older_gate_only_the_values_are_compared(database):
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, 1)
-        policy, manifest = version.learnt, version.manifest
+    policy, manifest = stored(database)
     older = {"grid_certificate": replace(manifest.grid_certificate, gate=GATE_VERSION - 1)}
     rewritten(database, 1, policy, manifest.model_copy(update=older))
     part = parts(database)[RELEARNT]
@@ -213,9 +214,7 @@ def test_of_an_older_gate_only_the_values_are_compared(database):
 
 
 def test_a_policy_of_a_network_is_certified_again_and_not_learnt_again(database):
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, 1)
-        policy, manifest = version.learnt, version.manifest
+    policy, manifest = stored(database)
     rewritten(database, 1, replace(policy, network=Network.of([(np.zeros((27, 3)), np.zeros(27))])), manifest)
     found = parts(database)
     assert found[RELEARNT].left_out == [

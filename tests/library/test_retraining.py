@@ -29,6 +29,7 @@ from tests.library.styles import (
     ask_retraining,
     count_versions,
     counted,
+    finish,
     look,
     parts_of,
     retrain,
@@ -79,15 +80,13 @@ def test_equal_requests_for_the_same_styles_are_one_job_until_one_fails(database
     assert ask_retraining(database).row == job.row
     assert ask_retraining(database, release=True).row != job.row
     assert ask_retraining(database, learner=CellQLearning()).row != job.row
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     assert ask_retraining(database).row == job.row
     cases.add_demo(database)
     more = ask_retraining(database)
     assert (more.row != job.row, more.request["styles"]) == (True, 4)
     cases.committed(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
-    for part in parts_of(database, more):
-        cases.work(database, part)
+    finish(database, more)
     assert look(database, more).state == "failed"
     again = ask_retraining(database)
     assert (again.row != more.row, again.state) == (True, "queued")
@@ -140,8 +139,7 @@ def test_a_cancelled_batch_stops_at_its_next_commit_and_drops_late_results(
         return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batches, "learn_style", learn)
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     assert (len(learnt), count_versions(database)) == (begun, kept)
     assert states_of(database, job) == ["done"] * kept + ["cancelled"] * (8 - kept)
     batch = look(database, job)

@@ -30,7 +30,7 @@ from skills.library.policies.retraining import request_retraining
 from skills.schemas.training import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
-from tests.library.styles import ask_retraining, parts_of, styles_of
+from tests.library.styles import ask_retraining, finish, styles_of
 
 SCENE = Scene(
     "PSM_base",
@@ -172,16 +172,14 @@ def test_a_batch_keeps_the_scene_of_a_style_and_its_learner(database):
     ).job
     assert [style.stale for style in styles_of(database, other)] == [["other limits at the near starts"]]
     job = ask_retraining(database)
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     (style,) = styles_of(database, job)
     assert style.policy.sha256 == version.sha256
     trained(database, scene_costs={"close": 0.2})  # newer, and not released
     (style,) = styles_of(database, ask_retraining(database, only_stale=True))
     assert style.stale == ["another scene"]
     named = ask_retraining(database, learner=PhaseQLearning(gamma=0.95))
-    for part in parts_of(database, named):
-        cases.work(database, part)
+    finish(database, named)
     (style,) = styles_of(database, named)
     assert style.policy.manifest.scene.scene == SCENE
     assert style.policy.manifest.learner == "phase-q-learning"

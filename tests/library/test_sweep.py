@@ -37,7 +37,7 @@ from skills.settings import Settings
 from skills.verification.playback import Pictures
 from tests.db.test_query_plans import noted
 from tests.library import cases
-from tests.library.styles import ask_retraining, look, parts_of
+from tests.library.styles import ask_retraining, finish, look, parts_of
 from tests.library.test_pictures import store_playback
 from tests.planning.motions import ideal_playback
 
@@ -222,8 +222,7 @@ def test_an_erased_surgeons_jobs_are_gone_at_once_and_swept_later(
 def test_ended_jobs_are_deleted_after_their_retention_with_their_batch(database: Database, small: None):
     cases.add_demo(database)
     job = ask_retraining(database)
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     young = cases.train(database, seed=9)
     add_jobs(database, 7, ended_at=now() - timedelta(days=30))
     days = settings_of(database, keep_jobs_days=20)

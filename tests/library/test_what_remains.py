@@ -22,7 +22,7 @@ from skills.library.recordings.recordings import store_recording
 from skills.schemas.training import TrainingIn
 from skills.verification.playback import Pictures
 from tests.library import cases, exports
-from tests.library.styles import ask_retraining, parts_of
+from tests.library.styles import ask_retraining, finish
 from tests.library.test_pictures import store_playback
 from tests.planning.motions import ideal_playback
 
@@ -69,8 +69,7 @@ def whole(database: Database, surgeon: str, shift: float, seed: int) -> list[str
         decide(session, uncut.sha256, 1, "rejected", "idle", "test")
     learn(database, surgeon, *demos, seed, release=True)
     job = ask_retraining(database, surgeon=surgeon)
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     exports.export(database, demos=demos[:1])
     return demos
 
