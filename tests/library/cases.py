@@ -1,12 +1,12 @@
 """Small hand-offs as tables and bags, and their way to a playback, with the library calls that the service makes."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from itertools import pairwise
 from threading import Event
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from sqlalchemy import select
@@ -20,6 +20,7 @@ from skills.formats import write_mcap
 from skills.jobs.workflows import Work
 from skills.learning.policy import describe_learner
 from skills.learning.q_learning import CellQLearning
+from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.jobs import BATCH
 from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
@@ -35,6 +36,7 @@ from skills.schemas.plans import PlanIn
 from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 
+T = TypeVar("T")
 SUTURE = "simple-running"
 PUBLISHED = CellQLearning.published()
 RATE_HZ = 50
@@ -73,6 +75,18 @@ def upload(data: bytes, media_type: str = "text/csv", **how: Any) -> Upload:
     return Upload(io.BytesIO(data), sha256(data), len(data), media_type, **how)
 
 
+def commit(database: Database, function: Callable[..., T], *given: Any, **how: Any) -> T:
+    """Call a function of the library in a writing transaction, and return its result."""
+    with database.writing() as session:
+        return function(session, *given, **how)
+
+
+def fetch(database: Database, function: Callable[..., T], *given: Any, **how: Any) -> T:
+    """Call a function of the library in a reading transaction, and return its result."""
+    with database.reading() as session:
+        return function(session, *given, **how)
+
+
 def add_surgeon(database: Database, slug: str = "kestrel", **about: Any) -> None:
     with database.writing() as session:
         seed_suture_types(session)
@@ -109,6 +123,12 @@ def work(database: Database, job: Job) -> Job:
     assert settled, "the job failed inside the service"
     with database.reading() as session:
         return session.get_one(Job, job.row)
+
+
+def wrong(database: Database, **how: Any) -> list[tuple[str, str]]:
+    """Inspect everything that is stored, as `skills verify` does, and return the faults."""
+    parts = {id(part): part for part in list(inspect_installation(database, **how))}.values()
+    return [one for part in parts for one in part.wrong]
 
 
 @contextmanager

@@ -12,11 +12,8 @@ from tests.library import cases
 @pytest.fixture(params=backends.BACKENDS)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
     """Yield a new database with the catalogue and kestrel, on either back end."""
-    url = backends.copy_of("kestrels", _add_kestrel, request.param, tmp_path)
-    database = Database(url)
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.copy_of("kestrels", _add_kestrel, request.param, tmp_path)) as database:
+        yield database
 
 
 def _add_kestrel(url: str) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from skills.comparison.combining import COMBININGS, Barycentre, Corridor, Medoid
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release
@@ -14,7 +14,7 @@ from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.parsed import parse_recording
 from skills.learning.evaluation import dtw
 from skills.library.operation.backup import back_up, restore
-from skills.library.operation.inspection import inspect_installation, inspect_policies
+from skills.library.operation.inspection import inspect_policies
 from skills.library.operation.integrity import learnt
 from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo, erase_surgeon
@@ -31,7 +31,8 @@ from skills.verification.intent import compare
 from skills.verification.requested import requested_motion
 from tests import backends
 from tests.library import cases
-from tests.library.styles import retrain
+from tests.library.cases import commit, fetch, wrong
+from tests.library.styles import counted, retrain
 
 SHIFTS_MM = ((0.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 1.5, 0.5))
 GONE = pytest.mark.parametrize(  # the demonstration that the policy's row names, and another one
@@ -48,15 +49,6 @@ def train(database: Database, demos: list[Demonstration], **asked) -> PolicyVers
     return cases.train(database, demos=[demo.sha256 for demo in demos], **asked)
 
 
-def wrong(database: Database) -> list[tuple[str, str]]:
-    return [one for part in {id(part): part for part in inspect_installation(database)}.values() for one in part.wrong]
-
-
-def rows(database: Database, table) -> int:
-    with database.reading() as session:
-        return session.scalar(select(func.count()).select_from(table)) or 0
-
-
 def served(database: Database) -> list[int]:
     with database.reading() as session:
         (surgeon,) = session.scalars(select(Demonstration.surgeon_row).distinct())
@@ -69,7 +61,7 @@ def test_it_names_all_of_them_passes_the_gate_and_is_verified(database: Database
     version = train(database, demos, combine=how, release=True)
     assert version.manifest.demos == [demo.sha256 for demo in demos]
     assert (version.releasable, served(database), wrong(database)) == (True, [1], [])
-    assert rows(database, PolicyDemonstration) == 2
+    assert counted(database, PolicyDemonstration) == 2
     with database.reading() as session:
         stored = find_by_digest(session, version.sha256)
         assert [one.sha256 for one in stored.demonstrations] == version.manifest.demos
@@ -126,8 +118,8 @@ def test_erasing_any_of_them_erases_the_policy(database: Database, how, gone):
     cases.add_plan(database)
     with database.writing() as session:
         assert erase_demo(session, demos[gone].sha256, "test") == []  # no unfinished job depends on it
-    assert [rows(database, table) for table in (PolicyVersion, PolicyDemonstration, Release)] == [0, 0, 0]
-    assert rows(database, Demonstration) == 2
+    assert [counted(database, table) for table in (PolicyVersion, PolicyDemonstration, Release)] == [0, 0, 0]
+    assert counted(database, Demonstration) == 2
     assert wrong(database) == []
 
 
@@ -141,16 +133,14 @@ def test_erasing_any_of_them_erases_the_policy(database: Database, how, gone):
 def test_one_that_leaves_while_it_is_learnt_from_leaves_no_policy(database: Database, leave, why):
     demos = add_three(database)
     request = cases.ask_training(database, demos=[demo.sha256 for demo in demos]).request
-    with database.reading() as session:
-        read = training.lessons(session, [demo.row for demo in demos])
+    read = fetch(database, training.lessons, [demo.row for demo in demos])
     learnt_meanwhile = training.learn_style(
         training.combined_lesson(read, Corridor()), request, Settings(database_url=database.url)
     )
-    with database.writing() as session:
-        leave(session, demos[0].sha256, "test")
+    commit(database, leave, demos[0].sha256, "test")
     with pytest.raises((Conflict, NotFound), match=why), database.writing() as session:
         training.store_style(session, learnt_meanwhile)
-    assert rows(database, PolicyVersion) == 0
+    assert counted(database, PolicyVersion) == 0
 
 
 def test_the_overview_does_not_wait_for_a_training_of_what_is_among_them(database: Database):
@@ -166,9 +156,8 @@ def test_the_overview_does_not_wait_for_a_training_of_what_is_among_them(databas
 
 def test_erasing_the_surgeon_leaves_nothing(database: Database):
     train(database, add_three(database), release=True)
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
-    assert [rows(database, table) for table in (PolicyVersion, PolicyDemonstration, Demonstration)] == [0, 0, 0]
+    commit(database, erase_surgeon, "kestrel", "test")
+    assert [counted(database, table) for table in (PolicyVersion, PolicyDemonstration, Demonstration)] == [0, 0, 0]
 
 
 @HOWS
@@ -213,8 +202,7 @@ def test_what_cannot_be_combined_is_refused_before_a_job_is_made(database: Datab
     ):
         with pytest.raises(BadInput, match=why):
             cases.ask_training(database, demos=[demo.sha256 for demo in demos], combine=how)
-    with database.writing() as session:
-        withdraw_demo(session, two.sha256, "test")
+    commit(database, withdraw_demo, two.sha256, "test")
     with pytest.raises(Conflict, match="withdrawn"):
         cases.ask_training(database, demos=[one.sha256, two.sha256])
 
@@ -250,13 +238,8 @@ def test_a_combined_policy_is_restored_with_its_demos_on_another_back_end(databa
     demos = add_three(database)
     train(database, demos, release=True)
     back_up(database, tmp_path / "all.zip")
-    other = Database(backends.blank("postgresql" if database.engine.dialect.name == "sqlite" else "sqlite", tmp_path))
-    try:
+    with backends.opened(backends.blank(backends.OTHER[database.engine.dialect.name], tmp_path)) as other:
         restore(other, tmp_path / "all.zip")
-        assert (rows(other, PolicyDemonstration), served(other), wrong(other)) == (2, [1], [])
-        with other.writing() as session:
-            withdraw_demo(session, demos[0].sha256, "test")
+        assert (counted(other, PolicyDemonstration), served(other), wrong(other)) == (2, [1], [])
+        commit(other, withdraw_demo, demos[0].sha256, "test")
         assert served(other) == []
-    finally:
-        other.close()
-        backends.drop(other.url)

@@ -18,7 +18,6 @@ from skills.library import perform as library
 from skills.library.comparison.scores import LEAST_DEMOS, score
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import keep_erasures, read_erasures
-from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
@@ -33,6 +32,7 @@ from skills.schemas.policies import GateRefusal
 from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
+from tests.library.cases import commit, fetch, wrong
 from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, styles_of
 
 WHY = "The needle fell."
@@ -44,8 +44,7 @@ def add(database: Database, shift_mm: float = 0.0, **cut: object) -> Demonstrati
 
 
 def mark(database: Database, demo: Demonstration, outcome: str, reason: str | None = WHY) -> Demonstration:
-    with database.writing() as session:
-        return mark_demo(session, demo.sha256, outcome, reason, "test")
+    return commit(database, mark_demo, demo.sha256, outcome, reason, "test")
 
 
 def served(database: Database) -> list[int]:
@@ -58,10 +57,6 @@ def served(database: Database) -> list[int]:
 def release_again(database: Database, version: PolicyVersion) -> None:
     with database.writing() as session:
         release(session, find_by_digest(session, version.sha256), "test")
-
-
-def wrong(database: Database) -> list[tuple[str, str]]:
-    return [one for part in {id(part): part for part in inspect_installation(database)}.values() for one in part.wrong]
 
 
 def actions(database: Database) -> Sequence[tuple[str, str]]:
@@ -143,8 +138,7 @@ def test_a_mark_is_seen_with_its_surgeon_and_goes_with_its_demonstration(databas
     with database.seen_by(Only("somebody", frozenset({mine.surgeon_row}))).reading() as session:
         assert session.scalars(select(DemonstrationOutcome.demonstration_row)).all() == [mine.row]
         assert [one.outcome for one in list_demos(session, 10, None, None, None)] == ["failure"]
-    with database.writing() as session:
-        erase_demo(session, mine.sha256, "test")
+    commit(database, erase_demo, mine.sha256, "test")
     assert counted(database, DemonstrationOutcome) == 1
     assert wrong(database) == []
 
@@ -165,8 +159,7 @@ def test_what_failed_is_learnt_from_only_if_told(database: Database, outcome: st
     mark(database, good, "failure")
     with pytest.raises(Conflict, match=r"Every active demonstration .* is marked recovery or failure"):
         cases.ask_training(database)
-    with database.reading() as session:
-        assert newest_demo(session, good.surgeon_row, cases.SUTURE) is None
+    assert fetch(database, newest_demo, good.surgeon_row, cases.SUTURE) is None
 
 
 def test_a_training_of_successes_keeps_identity_and_manifest(database: Database):

@@ -24,6 +24,7 @@ from skills.simulation import film, pictures
 from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
+from tests.library.cases import commit, fetch
 from tests.library.verdicts import verdict_on
 from tests.planning.motions import hand_off, ideal_playback
 from tests.planning.test_trajectory import BESIDE
@@ -85,11 +86,9 @@ def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
     assert job.id in refusal(database, playback)
     store = draw_pictures(database, job.request, Settings(database_url=database.url))
     for _ in range(2):  # the second time by a worker that does not know of the first
-        with database.writing() as session:
-            assert store(session, "test") == {"playback": playback.sha256}
+        assert commit(database, store, "test") == {"playback": playback.sha256}
     assert len(drawn(database)) == 1
-    with database.reading() as session:
-        found = find_pictures(session, playback)
+    found = fetch(database, find_pictures, playback)
     assert found.animation_mp4[4:8] == b"ftyp"
     assert found.animation_gif.startswith(b"GIF89a")
     assert all(png.startswith(b"\x89PNG") for png in (found.joints_png, found.clearance_png))
@@ -101,8 +100,7 @@ def test_asking_again_gives_the_same_job_until_it_has_failed(database: Database,
         assert playbacks.request_pictures(session, playback, "test")[0].row == job.row
         cancel(session, job.id, "test")
     assert f"client.draw('{playback.sha256}')" in refusal(database, playback)
-    with database.writing() as session:
-        again, new = playbacks.request_pictures(session, playback, "test")
+    again, new = commit(database, playbacks.request_pictures, playback, "test")
     assert new and again.row != job.row
     assert again.id in refusal(database, playback)
 

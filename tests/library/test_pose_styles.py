@@ -19,7 +19,6 @@ from skills.formats.bag_writer import write_mcap
 from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
-from skills.library.operation.inspection import HISTORY, inspect_installation
 from skills.library.people.erasure import erase_demo
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies import learning, training
@@ -31,6 +30,7 @@ from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
+from tests.library.cases import commit, fetch, wrong
 from tests.library.styles import NO_CONSENT, ask_retraining, parts_of, retrain, states_of
 
 MCAP = "application/vnd.mcap"
@@ -106,15 +106,6 @@ def rows_of(database: Database) -> list[Any]:
         return [tuple(row) for row in session.execute(text("SELECT sha256, policy_row, poses FROM pose_styles"))]
 
 
-def wrong(database: Database) -> list[tuple[str, str]]:
-    return [
-        one
-        for part in {id(p): p for p in inspect_installation(database)}.values()
-        for one in part.wrong
-        if part.what != HISTORY
-    ]
-
-
 def test_a_training_stores_the_poses_of_its_demonstration(database: Database):
     cases.add_surgeon(database)
     demo = add(database, turning())
@@ -177,8 +168,7 @@ def test_a_pose_style_is_erased_with_its_demonstration(database: Database):
     demo = add(database, turning())
     cases.train(database)
     assert stored(database) == 1
-    with database.writing() as session:
-        erase_demo(session, demo.sha256, "test")
+    commit(database, erase_demo, demo.sha256, "test")
     assert stored(database) == 0
 
 
@@ -271,8 +261,7 @@ def test_no_recording_is_read_without_consent(database: Database, monkeypatch: p
     cases.add_surgeon(database)
     add_both(database)
     job = cases.ask_training(database)
-    with database.writing() as session:
-        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
+    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
     monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     ended = cases.work(database, job)
     assert ended.state == "failed" and "consent" in (ended.error or "")
@@ -281,10 +270,8 @@ def test_no_recording_is_read_without_consent(database: Database, monkeypatch: p
 def test_a_recording_that_was_erased_meanwhile_is_named(database: Database):
     cases.add_surgeon(database)
     demo = add_both(database)
-    with database.reading() as session:
-        read = training.lessons(session, [demo.row])
-    with database.writing() as session:
-        erase_demo(session, demo.sha256, "test")
+    read = fetch(database, training.lessons, [demo.row])
+    commit(database, erase_demo, demo.sha256, "test")
     with pytest.raises(NotFound, match=r"A demonstration was erased while the training used it\."):
         training.with_partners(database, read, parse_recording)
 
@@ -295,13 +282,9 @@ def test_a_backup_holds_the_pose_styles(database: Database, tmp_path: Path):
     add(database, turning())
     cases.train(database)
     back_up(database, tmp_path / "all.zip")
-    other = Database(backends.blank("postgresql" if database.engine.dialect.name == "sqlite" else "sqlite", tmp_path))
-    try:
+    with backends.opened(backends.blank(backends.OTHER[database.engine.dialect.name], tmp_path)) as other:
         restore(other, tmp_path / "all.zip")
         assert (stored(other), wrong(other)) == (1, [])
-    finally:
-        other.close()
-        backends.drop(other.url)
 
 
 @pytest.mark.parametrize("changed", ["sha256 = 'e' || substr(sha256, 2)", "policy_row = 1"])
@@ -319,5 +302,4 @@ def test_a_changed_pose_style_is_refused_and_found(database: Database, changed: 
         poses_of(session.get_one(PolicyVersion, version.row))
     ((where, why),) = wrong(database)
     assert where.startswith("pose_styles") and "does not match its digest" in why
-    with database.writing() as session:
-        withdraw_demo(session, demo.sha256, "test")
+    commit(database, withdraw_demo, demo.sha256, "test")

@@ -33,6 +33,7 @@ from skills.settings import Settings
 from tests import backends
 from tests.library import cases
 from tests.library.attacks import tampering
+from tests.library.cases import commit
 from tests.library.test_pose_styles import add_both
 from tests.library.test_scenes import SCENE, SLIPPING
 
@@ -57,8 +58,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cases.train(database, learner=cases.PUBLISHED)
     cases.train(database, scene=SCENE.as_json(), learner=SLIPPING)
     cases.train(database, learner=ValueIteration(), combine=Corridor(), **two)
-    with database.writing() as session:
-        mark_demo(session, demos[1].sha256, "recovery", None, "test")
+    commit(database, mark_demo, demos[1].sha256, "recovery", None, "test")
     cases.train(database, outcomes="any", combine=Corridor(), **two)
     with database.writing() as session:  # not as when it was learnt from
         mark_demo(session, demos[2].sha256, "failure", None, "test")
@@ -241,8 +241,7 @@ def test_what_was_erased_meanwhile_is_not_called_wrong(database, monkeypatch):
 
 
 def test_without_consent_nothing_is_learnt_again(database):
-    with database.writing() as session:
-        cases.agree(session, {"uses": []})
+    commit(database, cases.agree, {"uses": []})
     part = parts(database)[RELEARNT]
     assert part.wrong == []
     assert len(part.left_out) == 6

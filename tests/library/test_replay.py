@@ -43,6 +43,7 @@ from skills.verification.probabilities import JUDGE_VERSION
 from tests.independent_history import check_envelope
 from tests.library import cases
 from tests.library.attacks import tampering
+from tests.library.cases import commit
 from tests.library.verdicts import doubt_of, verdict_on
 from tests.planning.motions import ideal_playback
 
@@ -176,8 +177,7 @@ def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: P
         ({"uses": ["export"]}, "does not cover training"),
         ({"uses": ["training", "export"], "until": "2001-01-01"}, "expired on 2001-01-01"),
     ):
-        with database.writing() as session:
-            cases.agree(session, consent)
+        commit(database, cases.agree, consent)
         with pytest.raises(Conflict, match=words):
             gate(database, plan)
     with database.writing() as session:
@@ -199,8 +199,7 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
     composed = replay.seal
 
     def withdrawn(members: dict[str, bytes]) -> bytes:
-        with database.writing() as session:
-            cases.agree(session, {"uses": ["training"], "until": None})
+        commit(database, cases.agree, {"uses": ["training"], "until": None})
         return composed(members)
 
     assert replay_bag(database, plan.sha256, OF_A1_ALONE)

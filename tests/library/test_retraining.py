@@ -23,6 +23,7 @@ from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
 from skills.schemas.training import FitOnTheSame, PolicyFigures
 from tests.library import cases
+from tests.library.cases import commit
 from tests.library.styles import (
     NO_CONSENT,
     add_styles,
@@ -86,8 +87,7 @@ def test_equal_requests_for_the_same_styles_are_one_job_until_one_fails(database
     cases.add_demo(database)
     more = ask_retraining(database)
     assert (more.row != job.row, more.request["styles"]) == (True, 4)
-    with database.writing() as session:
-        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
+    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
     for part in parts_of(database, more):
         cases.work(database, part)
     assert look(database, more).state == "failed"
@@ -139,8 +139,7 @@ def test_a_cancelled_batch_stops_at_its_next_commit_and_drops_late_results(
     def learn(lesson, request, settings):
         learnt.append(lesson.row)
         if len(learnt) == 3:
-            with database.writing() as session:
-                jobs.cancel(session, job.id, "test")
+            commit(database, jobs.cancel, job.id, "test")
         return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batches, "learn_style", learn)
@@ -185,8 +184,7 @@ def test_a_batch_all_of_whose_styles_were_erased_ends(database: Database):
     cases.add_demo(database)
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    commit(database, erase_surgeon, "kestrel", "test")
     cases.work(database, part)
     assert (look(database, job).state, look(database, job).result["done"]) == ("succeeded", 0)
 

@@ -34,6 +34,7 @@ from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
 from tests.by_day import some
 from tests.library import cases
+from tests.library.cases import commit
 from tests.model.replaced import Interruptible
 
 MCAP = "application/vnd.mcap"
@@ -202,8 +203,7 @@ def test_a_cancelled_try_stops_at_its_next_step(database: Database) -> None:
 
 def test_what_is_not_there_or_not_consented_is_refused_at_once(database: Database) -> None:
     recording = stored(database)
-    with database.writing() as session:
-        cases.agree(session, {"uses": ["export"]}, "heron")
+    commit(database, cases.agree, {"uses": ["export"]}, "heron")
     for surgeon, known, error in (
         ("nobody", recording, NotFound),
         ("kestrel", "0" * 64, NotFound),
@@ -217,8 +217,7 @@ def test_an_erased_demonstration_takes_its_tries_along(database: Database) -> No
     recording = stored(database)
     job = tried(database, recording)
     (digest,) = {one["id"] for one in steps(job) if one["name"] == "cut"}
-    with database.writing() as session:
-        erase_demo(session, digest, "test")
+    commit(database, erase_demo, digest, "test")
     assert count(database, Job) == 0
 
 
