@@ -102,13 +102,14 @@ deep: $(READY)
 	  $(BIN)/python -m pip install -q $(TORCH) ; \
 	fi
 
-# The locks hold versions and hashes, no addresses; the second one adds the extra `deep`, but for torch and what a build of
-# it for graphics cards brings along, and the third the builder of the documentation site. Needs uv.
+# The locks hold versions and hashes, no addresses. That of `serve` is a part of the first one, which tests need; `deep` adds
+# the extra, but for torch and what a build of it for graphics cards brings along, `docs` the builder of the site. Needs uv.
 HOW := --python-version 3.11 --universal --generate-hashes --no-header --no-annotate -q
 LOCK := uv pip compile pyproject.toml $(HOW)
 OF_TORCH := /^(torch|triton|cuda-[a-z]+|nvidia-[a-z0-9-]+)==/,/[^\\]$$/d
 lock:
 	$(LOCK) --group dev -o requirements.lock
+	$(LOCK) --group build -c requirements.lock -o requirements-serve.lock
 	@mkdir -p build
 	$(LOCK) --extra deep -c requirements.lock -o build/deep.lock
 	sed -E '$(OF_TORCH)' build/deep.lock > requirements-deep.lock

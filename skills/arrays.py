@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skills.errors import BadInput
-from skills.fields import Point
+from skills.fields import Point, Quaternion
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -64,7 +64,24 @@ def _is_frozen(values: ArrayLike, dtype: Any) -> TypeGuard[NDArray[Any]]:
     return values.flags.owndata and values.flags.c_contiguous and values.flags.aligned and not values.flags.writeable
 
 
+def interpolated(at: Floats, stamps: Floats, rows: Floats) -> Floats:
+    """Return rows, (T, K), at some places between their ascending stamps, (T,); beyond these the first or the last."""
+    return np.stack([np.interp(at, stamps, column) for column in rows.T], axis=1)
+
+
+def nearest(stamps: NDArray[Any], wanted: NDArray[Any]) -> Ints:
+    """Return the indices of those of some ascending stamps that are nearest to others; of two as near the earlier."""
+    known = stamps - stamps[:1]  # small, so that sums of nanoseconds are nanoseconds too
+    return np.asarray(np.searchsorted(known[:-1] + known[1:], 2 * (wanted - stamps[:1])), np.int64)
+
+
 def xyz(values: Floats) -> Point:
     """Return three numbers, shape (3,), as Python's own."""
     x, y, z = values.tolist()
     return x, y, z
+
+
+def xyzw(values: Floats) -> Quaternion:
+    """Return four numbers, shape (4,), as Python's own."""
+    x, y, z, w = values.tolist()
+    return x, y, z, w

@@ -248,7 +248,7 @@ def verdict(playback: Playback) -> str:
     """Return a playback's verdict in words."""
     line = playback.headline
     if not playback.feasible or line is None or line.probability is None:
-        return "feasible, not judged" if playback.feasible else str(playback.report.failure_in_words)
+        return "feasible, not judged" if playback.feasible else str(playback.report.failure_sentence)
     return f"feasible, {line.probability.count} of {line.probability.of} worlds"
 
 

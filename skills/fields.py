@@ -12,8 +12,19 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    PlainSerializer,
+    PlainValidator,
+    TypeAdapter,
+    WithJsonSchema,
+)
 from pydantic import computed_field as computed_field  # a property that is part of the JSON
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 Slug = Annotated[str, Field(description="Lower-case letters, digits, - and _.")]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$", description="SHA-256, in hex.")]
@@ -60,11 +71,37 @@ def _describe(json: dict[str, Any], cls: type) -> None:
         field.pop("default", None)  # of a constructor's argument, not of the JSON
         field.pop("readOnly", None)  # of a property: no request has these classes
     for base in reversed(cls.__mro__):  # from the most general on, so that a subclass may describe a field anew
-        text, _, attributes = cleandoc(base.__doc__ or "").partition("\nAttributes:\n")
-        json["description"] = text.strip()
-        for name, description in _ATTRIBUTE.findall(attributes):
+        json["description"], attributes = documented(base)
+        for name, description in attributes.items():
             if name in json["properties"]:
-                json["properties"][name]["description"] = re.sub(r"\bNone\b", "null", " ".join(description.split()))
+                json["properties"][name]["description"] = description
+
+
+def documented(cls: type) -> tuple[str, dict[str, str]]:
+    """Return the text of a class's docstring, and the descriptions in its section Attributes."""
+    text, _, attributes = cleandoc(cls.__doc__ or "").partition("\nAttributes:\n")
+    found = {name: " ".join(description.split()) for name, description in _ATTRIBUTE.findall(attributes)}
+    return text.strip(), {name: re.sub(r"\bNone\b", "null", description) for name, description in found.items()}
+
+
+class Documented(BaseModel):
+    """A model whose fields are described in the section Attributes of its docstring, as those of a `schema` are."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Give each field the description that the docstring has for it, before pydantic reads the annotations."""
+        super().__init_subclass__(**options)
+        own = cls.__annotations__
+        for name, description in documented(cls)[1].items():
+            if name in own:
+                own[name] = Annotated[own[name], Field(description=description)]
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the JSON schema, described by the text of the docstring alone."""
+        json = handler(core_schema)
+        if (text := documented(cls)[0]) and "$ref" not in json:
+            json["description"] = text
+        return json
 
 
 _adapter = cache(TypeAdapter[Any])  # built once for each class

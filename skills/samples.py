@@ -199,9 +199,9 @@ def _packed(trial: Trial) -> Iterator[Path]:
         yield trial.kinematics
         return
     with TemporaryDirectory() as folder, trial.kinematics.open("rb") as kinematics:
-        members: dict[str, IO[bytes]] = {trial.kinematics.name: kinematics}
+        members: dict[str, IO[bytes]] = {f"{trial.name}.txt": kinematics}
         if trial.transcription is not None:
-            members[f"transcriptions/{trial.kinematics.name}"] = io.BytesIO(trial.transcription.read_bytes())
+            members[f"transcriptions/{trial.name}.txt"] = io.BytesIO(trial.transcription.read_bytes())
         if trial.rated is not None:
             members["meta_file.txt"] = io.BytesIO(meta_line(trial.rated).encode())
         path = Path(folder) / "trial.zip"

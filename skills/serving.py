@@ -217,10 +217,7 @@ def refuse_keyless(settings: Settings) -> None:
         Conflict: It has neither.
     """
     if settings.beyond_loopback and settings.proxy_header is None:
-        with (
-            closing(Database.of(settings)) as database,
-            database.reading() as session,
-        ):
+        with closing(Database.of(settings)) as database, database.reading() as session:
             refuse_without_keys(session)
 
 

@@ -23,10 +23,10 @@ DATABASE = "skills.sqlite"  # the default one's file
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
-def _data_folder() -> Path:
-    """Return the folder of the default database."""
-    within = Path(os.environ.get("XDG_DATA_HOME", ""))
-    return (within if within.is_absolute() else Path.home() / ".local" / "share") / "suture-skills"
+def _folder(variable: str, name: str) -> Path:
+    """Return our folder in that of a variable, or else in `~/.local`; XDG has relative paths ignored."""
+    within = Path(os.environ.get(variable, ""))
+    return (within if within.is_absolute() else Path.home() / ".local" / name) / "suture-skills"
 
 
 def _cores() -> int:
@@ -34,17 +34,12 @@ def _cores() -> int:
     return min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
-def _state_folder() -> Path:
-    within = os.environ.get("XDG_STATE_HOME")
-    return (Path(within) if within else Path.home() / ".local" / "state") / "suture-skills"
-
-
 class Settings(BaseSettings):
     """The settings of an installation."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="ignore")
 
-    database_url: str = Field(default_factory=lambda: f"sqlite:///{_data_folder() / DATABASE}")
+    database_url: str = Field(default_factory=lambda: f"sqlite:///{_folder('XDG_DATA_HOME', 'share') / DATABASE}")
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
     root_path: str = ""
@@ -52,7 +47,7 @@ class Settings(BaseSettings):
     api_key: SecretStr | None = None  # the client's key for it
     erasures_file: Path | None = None  # list of erasures to apply after a restore; kept up to date if it is named
     # secret key that signs the history, made at the first start; kept apart from the database and its backups
-    signing_key: Path = Field(default_factory=lambda: _state_folder() / "signing.key")
+    signing_key: Path = Field(default_factory=lambda: _folder("XDG_STATE_HOME", "state") / "signing.key")
     # file to which each signed head of the history is appended, and with which the database is compared; by default a
     # file beside the signing key
     checkpoints: Path | None = None
@@ -79,9 +74,8 @@ class Settings(BaseSettings):
     max_dataset_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
     playback_timeout_s: float = Field(default=120.0, gt=0)
     playback_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
-    learning_timeout_s: float = Field(
-        default=3600.0, gt=0
-    )  # of a learner that is not tabular: default budgets take ten minutes
+    # of a learner that is not tabular: default budgets take ten minutes
+    learning_timeout_s: float = Field(default=3600.0, gt=0)
     # of address space: torch reserves half of it and uses a tenth
     learning_memory_bytes: int = Field(default=6144 * MEBIBYTE, gt=0)
     # errors of the arms (docs/errors.md), under which every pass must succeed: uncalibrated, calibrated, or the JSON of

@@ -47,10 +47,20 @@ def test_every_path_that_is_copied_exists_and_so_does_the_python():
     wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
     assert wanted == ">=3.11,<3.14"
     for image in of("FROM"):
-        assert re.search(r"/python:3\.1[123]-slim", image)
+        assert re.search(r"/python:3\.1[123]-slim[a-z-]*@sha256:[0-9a-f]{64}", image)
     for said in of("COPY"):
         if not said.startswith("--from="):
             assert all((ROOT / name).exists() for name in said.split()[:-1]), said
+
+
+def test_installs_are_checked_by_hashes_and_need_no_compiler():
+    installs = [said for said in of("RUN") if "pip install" in said]
+    assert len(installs) == 2
+    assert "--require-hashes --only-binary :all: -r /src/requirements-serve.lock" in installs[0]
+    assert "--no-deps /src/wheels/" in installs[1]
+    assert len({image.split()[0] for image in of("FROM")}) == 1
+    images = [one["image"] for one in COMPOSE["services"].values()]
+    assert [image for image in images if "@sha256:" not in image] == ["suture-skills", "suture-skills"]
 
 
 def test_the_container_is_no_root_and_can_write_to_its_folders_alone():

@@ -1,10 +1,13 @@
 """Dataclasses as the schemas of their JSON: required fields, descriptions from docstrings, properties that are sent."""
 
 from dataclasses import dataclass
+from importlib import import_module
+from pkgutil import iter_modules
 
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 
-from skills.fields import Count, Point, as_json, computed_field, schema
+import skills.schemas
+from skills.fields import Count, Documented, Point, as_json, computed_field, documented, schema
 
 
 @schema
@@ -64,3 +67,49 @@ def test_fields_are_described_by_the_docstrings_of_the_class_and_its_bases():
 def test_a_value_as_json_has_lists_and_its_sent_properties():
     said = as_json(Knot(entry_mm=(1.0, 2.5, 0), bites=2, throws=3))
     assert repr(said) == "{'entry_mm': [1.0, 2.5, 0], 'bites': 2, 'throws': 3, 'counted': True}"
+
+
+class Needle(Documented):
+    """A needle.
+
+    Attributes:
+        length_mm: Along
+            its arc.
+    """
+
+    length_mm: float = Field(gt=0)
+    name: str = Field(default="", description="Its maker's name.")
+
+
+class Curved(Needle):
+    """A curved needle."""
+
+    turn_deg: float
+
+
+def test_fields_of_models_and_of_their_bases_are_described():
+    found = Curved.model_json_schema()
+    assert found["description"] == "A curved needle."
+    assert Needle.model_json_schema()["description"] == "A needle."
+    assert found["properties"]["length_mm"]["description"] == "Along its arc."
+    assert found["properties"]["length_mm"]["exclusiveMinimum"] == 0
+    assert found["properties"]["name"]["description"] == "Its maker's name."
+    assert "description" not in found["properties"]["turn_deg"]
+
+
+def is_made(kind: type) -> bool:
+    """Return whether a model was made from a settings class, whose docstring describes class variables too."""
+    return getattr(import_module(kind.__module__), kind.__name__, None) is not kind
+
+
+def test_docstrings_of_models_describe_only_fields_that_there_are():
+    for module in iter_modules(skills.schemas.__path__, "skills.schemas."):
+        import_module(module.name)
+    kinds, seen = [Documented], set()
+    while kinds:
+        kind = kinds.pop()
+        kinds += kind.__subclasses__()
+        seen.add(kind.__name__)
+        if kind.__module__.startswith("skills.schemas") and kind.__doc__ and not is_made(kind):
+            assert documented(kind)[1].keys() <= kind.model_fields.keys(), kind
+    assert {"TrainingIn", "PolicyManifest"} <= seen

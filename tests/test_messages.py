@@ -17,8 +17,8 @@ from skills.cli import app
 from skills.client import Problem
 from skills.client.blocking.client import Client
 from skills.remedies import Action, Door, Remedy, did_you_mean, read_remedies
-from skills.schemas.given import Problem as ProblemDocument
-from skills.schemas.requests import in_words
+from skills.schemas.requests import describe
+from skills.schemas.responses import Problem as ProblemDocument
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
 from tests import backends
@@ -167,7 +167,7 @@ def test_every_form_of_a_text_in_a_request_has_its_words(door: Client):
     found = set(patterns_of(parameters)) | set(patterns_of(asked[1:]))
     assert len(found) >= 5
     for pattern in found:
-        assert re.fullmatch(r"\^\([\w|-]+\)\$", pattern) or in_words(pattern)
+        assert re.fullmatch(r"\^\([\w|-]+\)\$", pattern) or describe(pattern)
 
 
 def test_a_refusal_reads_in_the_words_of_service_client_and_command(door: Client):

@@ -16,7 +16,7 @@ import pytest
 from typer.main import get_command
 
 import skills
-from skills.api.routes import comparison, operating, pages, recordings, sign_in, timelines
+from skills.api.routes import operating, pages, sign_in
 from skills.cli import app
 from tests.api.conformance import conformance
 
@@ -35,9 +35,6 @@ SLASHED = re.compile(r"`([a-z_]+(?:/[a-z_]+)+)((?:\.\w+)*)`")
 COMMAND = re.compile(r"(?:^(?:\$ )?|`)skills ([a-z][^`\n#|]*)", re.MULTILINE)
 UNDESCRIBED = (
     pages.router,
-    recordings.page_router,
-    comparison.page_router,
-    timelines.page_router,
     sign_in.sign_in_router,
     operating.reference_router,
 )

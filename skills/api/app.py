@@ -111,7 +111,6 @@ def create_app(settings: Settings) -> FastAPI:
     for router in (  # the order of the calls in the OpenAPI document
         people.router,
         recordings.uploads,
-        demos.uploads,
         recordings.router,
         demos.router,
         training.router,
@@ -120,9 +119,7 @@ def create_app(settings: Settings) -> FastAPI:
         policies.router,
         plans.router,
         playbacks.router,
-        plans.trajectory_router,
         plans.suture_point_router,
-        playbacks.picture_router,
         timelines.router,
         cards.router,
         datasets.router,
@@ -131,9 +128,6 @@ def create_app(settings: Settings) -> FastAPI:
         operating.router,
         operating.reference_router,
         pages.router,
-        recordings.page_router,
-        comparison.page_router,
-        timelines.page_router,
         sign_in.sign_in_router,
         people.key_router,
     ):

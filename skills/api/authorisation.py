@@ -18,7 +18,7 @@ from skills.library.people.keys import LADDER
 from skills.remedies import Action, Remedy
 from skills.settings import Role
 
-__all__ = ["LOCAL", "Asking", "Caller", "Needs", "Role", "erasing_is_for_admins", "needs", "open_to_all"]
+__all__ = ["LOCAL", "Asking", "Caller", "Needs", "Role", "needs", "open_to_all"]
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ def refuse_release(caller: Caller, wanted: bool) -> None:
         caller.must_be("releaser")
 
 
-def needs(role: Role, *, whole: bool = False) -> Any:
-    """Declare the requirements of a route in its decorator: `dependencies=[needs("trainer")]`."""
+def needs(role: Role | None, *, whole: bool = False) -> Any:
+    """Declare the requirements of a route, as `skills.api.openapi.gives` and its like do in its decorator."""
     return Depends(Needs(role, whole))
 
 
@@ -123,11 +123,4 @@ async def _caller(request: HTTPConnection) -> Caller:
     return caller
 
 
-async def _erasing(caller: Annotated[Caller, Depends(_caller)], erase: bool = False) -> None:
-    """Require the role admin for `erase=true`, in addition to the requirements of the route."""
-    if erase:
-        caller.must_be("admin")
-
-
 Asking = Annotated[Caller, Depends(_caller)]
-erasing_is_for_admins = Depends(_erasing)

@@ -1,14 +1,11 @@
 """Encoded responses of policies, cached under the digest of the policy and the identity of its release."""
 
-import re
 from collections.abc import Collection
-from functools import lru_cache
 
-from skills.api.responses import JSON, Body, json_of, tag_of
+from skills.api.responses import JSON, Body, json_of, negotiate, tag_of
 from skills.db.history import History
 from skills.db.models import PolicyVersion, Release
 from skills.db.weighted_cache import WeightedCache
-from skills.errors import UnknownFormat
 from skills.library.operation.proofs import sign_files
 from skills.library.policies import answers
 from skills.library.policies.pose_styles import describe_pose_style, has_poses, poses_of
@@ -17,28 +14,8 @@ from skills.settings import MEBIBYTE
 from skills.transparency.notes import Note
 
 NPZ = "application/x-npz"
-GIVEN_FOR = {NPZ: NPZ, JSON: JSON, "application/*": JSON, "*/*": JSON}
-WEIGHT = re.compile(r";\s*q=(0(?:\.\d{0,3})?|1(?:\.0{0,3})?)\s*$")
+FORMATS = ("A policy", JSON, NPZ)  # for `negotiate`
 KEPT_BYTES = 64 * MEBIBYTE  # capacity of the cache; a policy's JSON is about 50 kB, with a million actions 3 MB
-
-
-@lru_cache(256)
-def negotiate(accept: str) -> str:
-    """Choose between JSON and arrays: the media type with the highest weight, and of equal weights the first.
-
-    Raises:
-        UnknownFormat: The client accepts neither.
-    """
-    chosen, most = None, 0.0
-    for part in accept.lower().split(","):
-        given = GIVEN_FOR.get(part.partition(";")[0].strip())
-        weight = WEIGHT.search(part)
-        weighs = float(weight[1]) if weight else 1.0
-        if given is not None and weighs > most:
-            chosen, most = given, weighs
-    if chosen is None:
-        raise UnknownFormat(f"A policy is available as {JSON} or {NPZ}; name one of them in Accept.")
-    return chosen
 
 
 class Encoded:
@@ -49,7 +26,7 @@ class Encoded:
 
     def policy(self, policy: PolicyVersion, release: Release | None, accept: str) -> Body:
         """Return the encoded response of a policy version and its release, from the cache if it is there."""
-        media_type = negotiate(accept)
+        media_type = negotiate(accept, *FORMATS)
         # With their times, because row and version numbers are used again after an erasure.
         released = (release.row, release.released_at) if release else None
         poses = policy.poses.sha256 if policy.poses else None

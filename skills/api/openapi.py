@@ -1,7 +1,8 @@
-"""The OpenAPI document: responses and errors of every call, in the form that code generators need.
+"""Declarations of routes, and the OpenAPI document, in the form that code generators need.
 
-A route declares its own responses (`gives`, `makes`, `starts_job`, `ends`); `complete` adds the responses that any call
-can have, and rewrites the document so that generators read it without loss (tests/api/test_generators.py):
+A route's decorator declares the role that it needs and its own responses (`gives`, `makes`, `starts_job`, `ends`);
+`complete` adds the responses that any call can have, and rewrites the document so that generators read it without loss
+(tests/api/test_generators.py):
 
 - every content has a schema, so that a JSON model next to another media type does not become a union with "unknown";
 - an optional field has no `default`, because generators treat such a field as always present; its description names
@@ -10,16 +11,22 @@ can have, and rewrites the document so that generators read it without loss (tes
 """
 
 import json
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, TypedDict
 
 from fastapi import APIRouter, Response
+from fastapi.routing import APIRoute
 
+from skills.api.authorisation import Role, needs
+from skills.api.dependencies import room_for_a_job
 from skills.api.gate import is_open
-from skills.schemas import Given
-from skills.schemas.given import Problem
+from skills.api.strict_json import Strict
+from skills.schemas import Given, Page
 from skills.schemas.operation import Job
+from skills.schemas.responses import Problem
+from skills.settings import MEBIBYTE
 
+Json = dict[str, Any]  # a part of the document
 PROBLEM = "application/problem+json"
 TEXT, BINARY = {"type": "string"}, {"type": "string", "format": "binary"}
 NO_PARAMETERS = ("accept", "content-type", "authorization")
@@ -53,76 +60,90 @@ HEADERS = {
 }
 
 
-def router_of(**options: Any) -> APIRouter:
-    """Return a router whose operations have the names of their functions as ids."""
-    return APIRouter(generate_unique_id_function=lambda route: route.name, **options)
+class Declared(TypedDict, total=False):
+    """Arguments of a route's decorator."""
+
+    dependencies: list[Any]
+    response_model: Any
+    response_class: type[Response]
+    status_code: int
+    responses: dict[int | str, Json]
 
 
-def gives(model: Any, *refused: int, as_well: tuple[str, ...] = ()) -> dict[str, Any]:
+def router_of(tag: str, **options: Any) -> APIRouter:
+    """Return a router with strict JSON of at most a mebibyte; the ids of its operations are the functions' names."""
+    options = {"route_class": Strict, "max_body_size": MEBIBYTE, **options}
+    return APIRouter(generate_unique_id_function=lambda route: route.name, tags=[tag], **options)
+
+
+def uploads_of(tag: str) -> APIRouter:
+    """Return a router of uploads, whose raw bodies are as large as the settings of the application allow."""
+    return router_of(tag, route_class=APIRoute, max_body_size=None)
+
+
+def gives(role: Role, model: Any, *refused: int, as_well: tuple[str, ...] = ()) -> Declared:
     """Describe a GET: its model, further media types for `Accept`, and its error statuses."""
-    ok: dict[str, Any] = {"headers": _headers("ETag")}
+    listed = isinstance(model, type) and issubclass(model, Page)
+    ok: Json = {"headers": _headers("ETag", *["Link"] * listed)}
     if as_well:
         ok["content"] = {kind: {"schema": TEXT if kind.startswith("text/") else BINARY} for kind in as_well}
-    return {"response_model": model, "responses": {200: ok, 304: UNCHANGED, **_refused(refused)}}
+    return says(role, model, *refused, answers={200: ok, 304: UNCHANGED})
 
 
-def gives_page(model: Any, *refused: int) -> dict[str, Any]:
-    """Describe a GET of one page of a list."""
-    described = gives(model, *refused)
-    described["responses"][200]["headers"] = _headers("ETag", "Link")
-    return described
-
-
-def gives_file(kinds: Iterable[str], *refused: int) -> dict[str, Any]:
+def gives_file(role: Role, kinds: Iterable[str], *refused: int) -> Declared:
     """Describe a GET of binary content."""
-    content = {kind: {"schema": BINARY} for kind in kinds}
-    ok = {"headers": _headers("ETag"), "content": content}
-    described = {200: ok, 304: UNCHANGED, **_refused(refused)}
-    return {"response_model": None, "response_class": Response, "responses": described}
+    ok: Json = {"headers": _headers("ETag"), "content": {kind: {"schema": BINARY} for kind in kinds}}
+    return says(role, None, *refused, answers={200: ok, 304: UNCHANGED}) | {"response_class": Response}
 
 
-def gives_stream(name: str, model: type[Given], description: str, *refused: int) -> dict[str, Any]:
+def gives_stream(role: Role, name: str, model: type[Given], description: str, *refused: int) -> Declared:
     """Describe a stream of server-sent events whose data are a model's JSON."""
     data = {"type": "string", "contentMediaType": "application/json", "contentSchema": _named(model)}
     event = {"type": "object", "properties": {"event": {"const": name}, "data": data}, "required": ["event", "data"]}
     content = {"text/event-stream": {"schema": TEXT, "itemSchema": event}}
-    described = {200: {"description": description, "content": content}, **_refused(refused)}
-    return {"response_model": None, "response_class": Response, "responses": described}
+    answers: dict[Any, Json] = {200: {"description": description, "content": content}}
+    return says(role, None, *refused, answers=answers) | {"response_class": Response}
 
 
-def makes(model: Any, *refused: int, located: bool = True) -> dict[str, Any]:
+def makes(role: Role, model: Any, *refused: int, located: bool = True) -> Declared:
     """Describe a call that stores something: 201, or 200 if it exists already."""
     headers = {"headers": _headers("Location")} if located else {}
     there = {"description": "It existed already.", "model": model, **headers}
-    return {
-        "response_model": model,
-        "status_code": 201,
-        "responses": {200: there, 201: {"description": "It is stored.", **headers}, **_refused(refused)},
-    }
+    answers = {200: there, 201: {"description": "It is stored.", **headers}}
+    return says(role, model, *refused, answers=answers) | {"status_code": 201}
 
 
-def starts_job(*refused: int) -> dict[str, Any]:
-    """Describe a call that requests a job: 202, or 200 if an equal request is done already."""
-    headers = {"headers": _headers("Location")}
-    done = {"description": "An equal request is done already.", "model": Job, **headers}
-    return {
-        "response_model": Job,
-        "status_code": 202,
-        "responses": {200: done, 202: {"description": "The job is queued.", **headers}, **_refused(refused)},
-    }
+def starts_job(*refused: int) -> Declared:
+    """Describe a trainer's request for a job, with room for one more: 202, or 200 if an equal request is done."""
+    headers = _headers("Location")
+    done = {"description": "An equal request is done already.", "model": Job, "headers": headers}
+    answers: dict[Any, Json] = {200: done, 202: {"description": "The job is queued.", "headers": headers}}
+    described = says("trainer", Job, *refused, answers=answers)
+    return described | {"status_code": 202, "dependencies": [*described["dependencies"], room_for_a_job]}
 
 
-def says(model: Any, *refused: int) -> dict[str, Any]:
-    """Describe a call that returns a model and stores nothing under an address of its own."""
-    return {"response_model": model, "responses": _refused(refused)}
+def says(
+    role: Role | None, model: Any, *refused: int, whole: bool = False, answers: Mapping[Any, Json] = {}
+) -> Declared:
+    """Describe a call by the role that it needs and by its answers.
+
+    Args:
+        role: The lowest role that may call it; None: it needs no authentication.
+        model: The model of its answer.
+        refused: The statuses of its errors.
+        whole: Refuse keys that are restricted to some surgeons.
+        answers: Further facts about its answers, by status.
+    """
+    responses: dict[int | str, Json] = {**answers, **{status: _refusal(status) for status in refused}}
+    return {"dependencies": [needs(role, whole=whole)], "response_model": model, "responses": responses}
 
 
-def ends(*refused: int) -> dict[str, Any]:
+def ends(role: Role, *refused: int) -> Declared:
     """Describe a call that removes something: 204."""
-    return {"status_code": 204, "responses": _refused(refused)}
+    return says(role, None, *refused) | {"status_code": 204}
 
 
-def complete(document: dict[str, Any]) -> dict[str, Any]:
+def complete(document: Json) -> Json:
     """Add to every operation the errors that any call can have, the problem schema, and the security schemes."""
     schemas = document["components"]["schemas"]
     for unused in ("HTTPValidationError", "ValidationError"):
@@ -152,7 +173,7 @@ def complete(document: dict[str, Any]) -> dict[str, Any]:
     return document
 
 
-def _without_default(field: dict[str, Any]) -> None:
+def _without_default(field: Json) -> None:
     """Move the default of an optional field into its description."""
     default = field.pop("default", None)
     if default is not None:
@@ -160,11 +181,7 @@ def _without_default(field: dict[str, Any]) -> None:
         field["description"] = f"{field['description']} {said}" if "description" in field else said
 
 
-def _refused(statuses: tuple[int, ...]) -> dict[Any, Any]:
-    return {status: _refusal(status) for status in statuses}
-
-
-def _refusal(status: int) -> dict[str, Any]:
+def _refusal(status: int) -> Json:
     headers = {"headers": _headers("Retry-After")} if status in (429, 503) else {}
     content = {PROBLEM: {"schema": _named(Problem)}}
     return {"description": REFUSALS[status], "content": content, **headers}
@@ -174,7 +191,7 @@ def _named(model: type[Given]) -> dict[str, str]:
     return {"$ref": f"#/components/schemas/{model.__name__}"}
 
 
-def _headers(*named: str) -> dict[str, Any]:
+def _headers(*named: str) -> Json:
     return {name: HEADERS[name] for name in named}
 
 

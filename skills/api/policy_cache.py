@@ -18,8 +18,8 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skills.api.authorisation import Needs
-from skills.api.encoded_policies import KEPT_BYTES, Encoded, negotiate
-from skills.api.responses import Body, answer
+from skills.api.encoded_policies import FORMATS, KEPT_BYTES, Encoded
+from skills.api.responses import Body, answer, negotiate
 from skills.db.changes import Unasked, changes_of
 from skills.db.session import Database
 from skills.db.weighted_cache import WeightedCache
@@ -231,10 +231,8 @@ def _asked(headers: list[tuple[bytes, bytes]]) -> tuple[str, str | None] | None:
             if name not in USUAL or name in found or len(value) > LONGEST:
                 return None
             found[name] = value
-    have = found.get(b"if-none-match")
+    said = {name: value.decode("latin-1") for name, value in found.items()}
     try:
-        return negotiate(found.get(b"accept", b"*/*").decode("latin-1")), None if have is None else have.decode(
-            "latin-1"
-        )
+        return negotiate(said.get(b"accept", "*/*"), *FORMATS), said.get(b"if-none-match")
     except UnknownFormat:
         return None

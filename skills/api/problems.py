@@ -21,7 +21,7 @@ from starlette.exceptions import HTTPException
 
 from skills import errors
 from skills.remedies import Action, Door, Remedy, did_you_mean
-from skills.schemas.requests import in_words
+from skills.schemas.requests import describe
 
 log = logging.getLogger("skills.api")
 
@@ -84,6 +84,9 @@ SYSTEM: dict[int, errors.Busy] = {
         ),
     ),
 }
+# The kinds of pydantic's errors, each with the words for it.
+DATE_KINDS = ("date_type", "date_parsing", "date_from_datetime_parsing")
+TIME_KINDS = ("datetime_type", "datetime_parsing", "datetime_from_date_parsing")
 LIMITS = {
     "missing": "is missing",
     "greater_than": "must be more than {gt}",
@@ -91,32 +94,21 @@ LIMITS = {
     "less_than": "must be less than {lt}",
     "less_than_equal": "must be at most {le}",
     "finite_number": "must be a finite number",
-    "float_type": "must be a number",
-    "float_parsing": "must be a number",
-    "int_type": "must be a whole number",
-    "int_parsing": "must be a whole number",
+    **dict.fromkeys(("float_type", "float_parsing"), "must be a number"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
     "int_parsing_size": "must be a smaller whole number",
-    "int_from_float": "must be a whole number",
-    "bool_type": "must be true or false",
-    "bool_parsing": "must be true or false",
-    "string_type": "must be a text",
+    **dict.fromkeys(("bool_type", "bool_parsing"), "must be true or false"),
+    **dict.fromkeys(("string_type", "string_unicode"), "must be a text"),
     "string_too_short": "must have at least {min_length} characters",
     "string_too_long": "must have at most {max_length} characters",
-    "string_unicode": "must be a text",
     "list_type": "must be a list",
     "tuple_type": "must be a list of numbers",
     "too_short": "must have at least {min_length} entries, and has {actual_length}",
     "too_long": "must have at most {max_length} entries",
-    "model_attributes_type": "must be an object with named fields",
-    "model_type": "must be an object with named fields",
-    "dict_type": "must be an object with named fields",
+    **dict.fromkeys(("model_attributes_type", "model_type", "dict_type"), "must be an object with named fields"),
     "union_tag_not_found": "needs a kind",
-    "date_type": "must be a date such as 2030-12-31",
-    "date_parsing": "must be a date such as 2030-12-31",
-    "date_from_datetime_parsing": "must be a date such as 2030-12-31",
-    "datetime_type": "must be a time such as 2030-12-31T12:00:00Z",
-    "datetime_parsing": "must be a time such as 2030-12-31T12:00:00Z",
-    "datetime_from_date_parsing": "must be a time such as 2030-12-31T12:00:00Z",
+    **dict.fromkeys(DATE_KINDS, "must be a date such as 2030-12-31"),
+    **dict.fromkeys(TIME_KINDS, "must be a time such as 2030-12-31T12:00:00Z"),
     "timezone_aware": "must have a time zone, such as 2030-12-31T12:00:00Z",
 }
 TOO_LARGE = problem(413, "http-413", TITLES[413], DETAILS[413])  # replaces Starlette's plain-text response
@@ -170,7 +162,7 @@ def _why(one: dict[str, Any], body: Any = None) -> str:
     if kind == "string_pattern_mismatch":
         one_of = re.fullmatch(r"\^\(([\w|-]+)\)\$", about["pattern"])
         if one_of is None:
-            return in_words(about["pattern"])
+            return describe(about["pattern"])
         return f"must be one of {one_of[1].replace('|', ', ')}{_meant(given, one_of[1].split('|'))}"
     if kind in ("literal_error", "union_tag_invalid"):
         known = re.findall(r"'([^']+)'", about.get("expected") or about["expected_tags"])

@@ -1,13 +1,14 @@
-"""HTTP responses: JSON with ETags, conditional requests, and paging.
+"""HTTP responses: content negotiation, JSON with ETags, conditional requests, paging, and requests for jobs.
 
-The ETag of a response is the SHA-256 of its bytes. Conditions follow RFC 9110, section 13.
+The ETag of a response is the SHA-256 of its bytes. Negotiation follows RFC 9110, section 12, conditions section 13.
 """
 
 import hashlib
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Annotated, Any
+from functools import cached_property, lru_cache
+from typing import Annotated, Any, Generic, TypeVar
 
 import orjson
 from fastapi import Depends, Header, Request, Response
@@ -15,12 +16,44 @@ from pydantic import BaseModel
 from sqlalchemy.orm import Session
 
 from skills.db.service_tables import Job
-from skills.errors import PreconditionFailed
+from skills.db.session import Database
+from skills.errors import PreconditionFailed, UnknownFormat
 from skills.formats import BYTES
+from skills.jobs import Engine
+from skills.library.operation.jobs import RequestedJob
 from skills.library.policies.outcomes import describe_job
 
-JSON = "application/json"
+JSON, HTML = "application/json", "text/html"
+WEIGHT = re.compile(r";\s*q=(0(?:\.\d{0,3})?|1(?:\.0{0,3})?)\s*$")
 Condition = Annotated[str | None, Header(max_length=2000)]
+T = TypeVar("T")
+
+
+@lru_cache(256)
+def negotiate(accept: str, resource: str, *offered: str) -> str:
+    """Return the media type with the highest weight, and of equal weights the first that the client names.
+
+    Args:
+        accept: The header of this name.
+        resource: The resource, as the subject of the error's sentence.
+        offered: Its media types; a range such as `*/*` or `text/*` stands for the first of them in it.
+
+    Raises:
+        UnknownFormat: The client accepts none of them.
+    """
+    named = {"*/*": offered[0]}
+    for kind in reversed(offered):
+        named |= {f"{kind.partition('/')[0]}/*": kind, kind: kind}
+    chosen, most = None, 0.0
+    for part in accept.lower().split(","):
+        kind_of_part, weight = named.get(part.partition(";")[0].strip()), WEIGHT.search(part)
+        weighs = float(weight[1]) if weight else 1.0
+        if kind_of_part is not None and weighs > most:
+            chosen, most = kind_of_part, weighs
+    if chosen is None:
+        listed = f"{', '.join(offered[:-1])} or {offered[-1]}"
+        raise UnknownFormat(f"{resource} is available as {listed}; name one of them in Accept.")
+    return chosen
 
 
 def tag_of(content: bytes) -> str:
@@ -119,8 +152,12 @@ class Give:
     """Builder of the response to a GET: 304 if the client has exactly these bytes already."""
 
     def __init__(self, request: Request, have: str | None) -> None:
-        self._request = request
+        self.request = request
         self._have = have
+
+    def is_known(self, tag: str) -> bool:
+        """Return whether the client has the bytes with this ETag already."""
+        return self._have is not None and names(self._have, tag)
 
     def __call__(self, said: Any) -> Response:
         """Return one resource as JSON."""
@@ -130,19 +167,15 @@ class Give:
         """Return bytes with their media type."""
         tag = tag_of(content)
         headers = {"ETag": tag, "Vary": "Accept", "Cache-Control": "no-cache"}
-        if self._have is not None and names(self._have, tag):
+        if self.is_known(tag):
             return Response(status_code=304, headers=headers)
         return Response(content, headers=headers, media_type=media_type)
 
-    def page(self, items: Sequence[Any], limit: int, cursor: Any, **more: Any) -> Response:
-        """Return one page of a list, with the cursor of the next page in `next` and in a `Link` header (RFC 8288).
-
-        A full page has a cursor even if no item follows it.
-        """
-        following = cursor if len(items) == limit else None
+    def page(self, items: Sequence[Any], following: int | str | None, **more: Any) -> Response:
+        """Return one page of a list, with the cursor of the next page in `next` and in a `Link` header (RFC 8288)."""
         answer = self({**more, "items": items, "next": following})
         if following is not None:
-            query = self._request.url.include_query_params(cursor=following).query
+            query = self.request.url.include_query_params(cursor=following).query
             # a relative URL, because a proxy may serve this path under a prefix
             answer.headers["Link"] = f'<?{query}>; rel="next"'
         return answer
@@ -153,6 +186,46 @@ async def _give(request: Request, if_none_match: Condition = None) -> Give:
 
 
 Giving = Annotated[Give, Depends(_give)]
+
+
+@dataclass(frozen=True)
+class Listing(Generic[T]):
+    """The page of a list that a client asks for: the most items on it, and the cursor at which it begins."""
+
+    give: Give
+    limit: int
+    cursor: T | None
+
+    def page(self, items: Sequence[Any], rows: Sequence[Any], by: str = "row", **more: Any) -> Response:
+        """Return the page of some items; the attribute `by` of the last of their rows is the cursor of the next page.
+
+        A full page has a cursor even if no item follows it.
+        """
+        return self.give.page(items, getattr(rows[-1], by) if len(rows) == self.limit else None, **more)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """The conditions of a request on the ETag of its resource."""
+
+    if_match: str | None
+    if_none_match: str | None
+
+    def answer(self, body: Body) -> EncodedResponse:
+        """Return a response with a body, as `answer` does."""
+        return answer(body, self.if_none_match, self.if_match)
+
+    def refuse_changed(self, said: Any) -> None:
+        """Check the conditions of a change, as `refuse_changed` does; an empty header is none."""
+        if self.if_match or self.if_none_match:
+            refuse_changed(said, self.if_match, self.if_none_match)
+
+
+async def _conditions(if_match: Condition = None, if_none_match: Condition = None) -> Conditions:
+    return Conditions(if_match, if_none_match)
+
+
+Conditional = Annotated[Conditions, Depends(_conditions)]
 
 
 def as_asked(accept: str, kind: str) -> str:
@@ -170,6 +243,19 @@ def accepted(session: Session, job: Job, did: str) -> Response:
     """Return the response to a request for a job: 200 once it succeeded, else 202; `did` is the request's effect."""
     said = describe_job(session, job, did)
     return say(said, 200 if job.state == "succeeded" else 202, {"Location": f"/jobs/{job.id}"})
+
+
+def start_job(
+    db: Database, engine: Engine, names: Iterable[str] | None, request: Callable[[Session], RequestedJob]
+) -> Response:
+    """Request a job in a transaction that locks some names, or all, and return the response to it."""
+    with db.writing(names) as session:
+        job, new, did = request(session)
+        answer = accepted(session, job, did)
+    # after the commit; if the engine cannot be notified now, a worker finds the job's row later
+    if new:
+        engine.submit(job.row, job.attempt, job.kind)
+    return answer
 
 
 def say(said: Any, status: int = 200, headers: dict[str, str] | None = None) -> Response:

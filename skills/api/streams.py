@@ -10,12 +10,12 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 
 from anyio import CapacityLimiter, to_thread
-from fastapi import Request, Response
+from fastapi import Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy.orm import Session
 from starlette.types import Send
 
-from skills.api.responses import as_asked, names
+from skills.api.responses import Give, as_asked
 from skills.db.models import StoredRecording
 from skills.db.service_tables import StoredDataset
 from skills.db.session import Database
@@ -50,31 +50,28 @@ class Stream(StreamingResponse):
 
 
 def stored_file(
-    request: Request,
+    give: Give,
     database: Database,
     find: Callable[[Session], StoredRecording | StoredDataset],
     read: Callable[[int], bytes | None],
-    *,
     accept: str,
-    if_none_match: str | None,
     attachment: str | None = None,
 ) -> Response:
     """Return the bytes of a stored file; all of them are verified before the first one is sent.
 
     Args:
-        request: The request.
+        give: The answer to the request.
         database: The database, restricted to the rows that the caller may see.
         find: Returns the file's row; raises if it was erased, or may not be passed on.
         read: Returns a chunk by its number, in a transaction of its own; None after the last one.
         accept: The header of this name.
-        if_none_match: The header of this name.
         attachment: The name under which a browser stores it, with a place for its digest.
     """
     with database.reading() as session:
         found = find(session)
         sha256, kind, tag = found.sha256, as_asked(accept, found.media_type), {"ETag": f'"{found.sha256}"'}
         headers = {"Content-Length": str(found.size_bytes), **tag}
-    if if_none_match is not None and names(if_none_match, tag["ETag"]):
+    if give.is_known(tag["ETag"]):
         return Response(status_code=304, headers=tag)
     if attachment is not None:
         headers["Content-Disposition"] = f'attachment; filename="{attachment.format(sha256[:12])}"'
@@ -84,7 +81,7 @@ def stored_file(
             find(session)
 
     # outside the session, because a slow client may keep the stream open for long
-    return Stream(stored_pieces(read, refuse, sha256, request.app.state.downloads), kind, headers)
+    return Stream(stored_pieces(read, refuse, sha256, give.request.app.state.downloads), kind, headers)
 
 
 async def stored_pieces(

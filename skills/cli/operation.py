@@ -262,7 +262,8 @@ def verify(
     if bag is not None:
         from skills.formats.verify import verify_bag
 
-        lines = list(verify_bag(bag, None if key is None else read_key(key)))
+        with bag.open("rb") as file:
+            lines = verify_bag(file, None if key is None else read_key(key))
         return outcome("\n".join(lines), whole=True, checked=lines)
     from skills.db.session import Database
     from skills.library.operation.history import sign_some_history

@@ -183,7 +183,7 @@ def play(
             (pictures / "clearance.png").write_bytes(client.plot(playback.id, "clearance"))
     assert playback.headline is not None, playback
     sentences = [playback.headline.text]
-    for under in playback.report.doubt.under:
+    for under in playback.report.estimate.under:
         least = min(one.succeeds.lower for one in under.passes)
         sentences.append(
             f"{under.errors.name}: {under.errors.describe()}; every pass succeeds with a probability of at least "

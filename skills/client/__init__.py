@@ -5,8 +5,8 @@
         client.wait(client.train("kestrel", "simple-running", release=True))
         policy = client.policy("kestrel", "simple-running")
 
-Responses are the models of `skills.schemas.given`; unknown fields are ignored, and `client.get_json` returns a response
-as plain JSON. An error that the service returns is raised as `Problem`.
+Responses are the models of `skills.schemas`; unknown fields are ignored, and `client.get_json` returns a response as
+plain JSON. An error that the service returns is raised as `Problem`.
 
 The modules here are those of `AsyncClient`. `python -m tests.generated` generates `blocking/` from
 them, except `waiting` and `socket`, and `skills.keywords` from the models of requests.

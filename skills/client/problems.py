@@ -15,9 +15,9 @@ from pydantic import ValidationError
 
 from skills.errors import SkillsError
 from skills.remedies import read_remedies
-from skills.schemas.given import Problem as ProblemDocument
-from skills.schemas.given import WrongField
 from skills.schemas.operation import Job
+from skills.schemas.responses import Problem as ProblemDocument
+from skills.schemas.responses import WrongField
 
 TOO_MANY, UNAVAILABLE = 429, 503
 PARTS_OF_A_REQUEST = ("body", "query", "path", "header")

@@ -5,13 +5,13 @@
 
 The paper learns from one demonstration. There are three methods to combine several:
 
-* `Medoid`: the demonstration that is nearest to all the others. Nothing is invented: it was really performed.
-* `Barycentre`: the path with the least total DTW distance to all of them (DTW barycentre averaging; Petitjean,
+* "medoid": the demonstration that is nearest to all the others. Nothing is invented: it was really performed.
+* "barycentre": the path with the least total DTW distance to all of them (DTW barycentre averaging; Petitjean,
   Ketterlin and Gancarski, Pattern Recognition 44, 2011). Our distance is the paper's, Manhattan, so the points warped
   to a state are averaged by their *median* along each axis: it minimises the sum of absolute differences, as the mean
   of the original minimises that of squares. Each round warps again and takes medians again; neither makes the total
   larger. It begins with the medoid, so its total is never above the medoid's.
-* `Corridor`: where the demonstrations agree, their middle. Each has one vote on each state of the medoid, the mean of
+* "corridor": where the demonstrations agree, their middle. Each has one vote on each state of the medoid, the mean of
   its points that are warped to that state. A vote agrees if it is no further from the votes' median than `AGREEING`
   times the distance within which the majority is, and the path is the mean of the votes that agree. A demonstration
   that deviates has no influence there, but counts where it is with the others. Ours.
@@ -34,7 +34,7 @@ wound do not turn. This is ours; the paper moves passes only.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -117,29 +117,9 @@ NANOMETRE = 6  # decimals of a mm: warping has ties, and every machine should fi
 MAX_ROUNDS = 100  # of the barycentre; it converges after 5 to 15
 
 
-@dataclass(frozen=True)
-class Medoid:
-    """The method that follows the demonstration nearest to all."""
-
-    kind: ClassVar[Literal["medoid"]] = "medoid"
-
-
-@dataclass(frozen=True)
-class Barycentre:
-    """The method that follows the path of the least total distance to all."""
-
-    kind: ClassVar[Literal["barycentre"]] = "barycentre"
-
-
-@dataclass(frozen=True)
-class Corridor:
-    """The method that follows the middle of the demonstrations that agree."""
-
-    kind: ClassVar[Literal["corridor"]] = "corridor"
-
-
-Combining = Medoid | Barycentre | Corridor
-COMBININGS: dict[str, type[Combining]] = {one.kind: one for one in get_args(Combining)}
+# The demonstration nearest to all, the path of the least total distance to all, or the middle of those that agree.
+Combining = Literal["medoid", "barycentre", "corridor"]
+COMBININGS: tuple[Combining, ...] = get_args(Combining)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +165,11 @@ def combine(demos: Sequence[Demo], how: Combining) -> Combined:
     ways_mm, _ = side_by_side(demos)
     # Reversed, so that the newest is taken among equals.
     nearest = medoid(distances(ways_mm, ways_mm), np.arange(len(demos))[::-1])
-    at = nearest if isinstance(how, Medoid) else len(demos) - 1
+    at = nearest if how == "medoid" else len(demos) - 1
     ways_mm, moved = side_by_side(demos, at)
-    tip_mm = _follow(ways_mm, ways_mm[nearest], how).round(NANOMETRE)
+    tip_mm = ways_mm[nearest]
+    if how != "medoid":
+        tip_mm = (barycentre if how == "barycentre" else corridor)(ways_mm, tip_mm).round(NANOMETRE)
     apart_mm = distances(tip_mm[None], ways_mm)[0] / len(tip_mm)
     return Combined(tip_mm, widths(ways_mm, tip_mm), apart_mm, nearest, at, moved)
 
@@ -232,7 +214,7 @@ def followed(demos: Sequence[Demo], paths: Sequence[GridPath], how: Combining) -
     """
     combined = combine(demos, how)
     one, like = demos[combined.at], paths[combined.at]
-    if isinstance(how, Medoid):
+    if how == "medoid":
         return Followed(combined, one, like)
     grid = like.grid
     if not grid.holds(grid.cells_at(combined.tip_mm)).all():
@@ -282,16 +264,6 @@ def side_by_side(demos: Sequence[Demo], at: int = -1) -> tuple[Floats, bool]:
 def _way(demo: Demo) -> Floats:
     """Return states equally far apart along a demonstration's path, without tremor: (S, 3) mm."""
     return resampled(smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)[1])
-
-
-def _follow(ways_mm: Floats, medoid_mm: Floats, how: Combining) -> Floats:
-    match how:
-        case Medoid():
-            return medoid_mm
-        case Barycentre():
-            return barycentre(ways_mm, medoid_mm)
-        case Corridor():
-            return corridor(ways_mm, medoid_mm)
 
 
 def barycentre(ways_mm: Floats, first_mm: Floats) -> Floats:

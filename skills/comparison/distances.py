@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import product
-from skills.arrays import Floats, Ints, freeze, frozen
+from skills.arrays import Floats, Ints, freeze, frozen, interpolated
 from skills.compiled import compiled, inner
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import smoothed_tip
@@ -89,7 +89,7 @@ def resampled(tip_mm: Floats, states: int = STATES) -> Floats:
     """
     along_mm = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
     at_mm = np.linspace(0.0, along_mm[-1], states)
-    return np.stack([np.interp(at_mm, along_mm, axis) for axis in tip_mm.T], axis=1)
+    return interpolated(at_mm, along_mm, tip_mm)
 
 
 def placed(tip_mm: Floats, *, scaled: bool = False) -> Floats:

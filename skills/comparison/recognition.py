@@ -48,7 +48,7 @@ from math import exp, log
 import numpy as np
 
 from skills.arithmetic import wilson
-from skills.arrays import Flags, Floats, Ints, freeze
+from skills.arrays import Flags, Floats, Ints, freeze, interpolated
 from skills.comparison.distances import STATES, TREMOR_S, placed, resampled
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
@@ -161,7 +161,7 @@ _COSINES = np.cos(np.pi * np.arange(5)[:, None] * (np.arange(PHASES) + 0.5) / PH
 
 def _at_phases(seconds: Floats, values: Floats) -> Floats:
     """Return the rows of a curve at even phases, shape (PHASES, K)."""
-    return np.stack([np.interp(_PHASE * seconds[-1], seconds, axis) for axis in values.T], axis=1)
+    return interpolated(_PHASE * seconds[-1], seconds, values)
 
 
 def _coefficients(curve: Floats, count: int) -> Floats:
@@ -369,7 +369,8 @@ def validate(
     sets = usable(signatures) if sets is None else sets
     fold = folds_of(sessions, truth, FOLDS)
     # A surgeon whose sessions were all left out together cannot be tested.
-    tested = np.array([one for one in range(len(truth)) if _elsewhere(truth, fold, one)], np.int64)
+    elsewhere = (truth[:, None] == truth) & (fold[:, None] != fold)
+    tested = np.flatnonzero(elsewhere.any(axis=1))
     if len(np.unique(truth[tested])) < 2:
         raise BadInput("Recognition needs at least two surgeons with two sessions each; record more.")
     settings, temperature = _choose(signatures, truth, sessions, len(labels), sets)
@@ -402,11 +403,6 @@ def _left_out(fold: Ints) -> Iterator[Flags]:
     """Yield the demonstrations of each group, as flags; of a single group, none, for nothing is left to learn from."""
     groups = np.unique(fold)
     yield from (fold == one for one in groups if len(groups) > 1)
-
-
-def _elsewhere(truth: Ints, fold: Ints, one: int) -> bool:
-    """Return whether the surgeon of a demonstration has another one in another group."""
-    return bool(((truth == truth[one]) & (fold != fold[one])).any())
 
 
 def recognise(

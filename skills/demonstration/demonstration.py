@@ -19,12 +19,7 @@ import numpy as np
 from skills.arrays import Floats, freeze
 from skills.demonstration.movement import Pause, clutched, is_driven, undriven
 from skills.demonstration.partner import Partner, PartnerMotion, in_base, partner_along, partner_at
-from skills.demonstration.recording import (
-    BaseFrame,
-    Motion,
-    Recording,
-    base_frames,
-)
+from skills.demonstration.recording import BaseFrame, Motion, Recording, base_frames
 from skills.errors import BadSegment, JointsDisagree, NotMetres
 from skills.notebook import card
 

@@ -34,18 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import arccos, arcsin, product
-from skills.arrays import Floats, frozen, xyz
-from skills.demonstration.hypotheses import (
-    ARMS,
-    HYPOTHESES,
-    KNOWN,
-    OTHER_WRISTS,
-    Generation,
-    Hypothesis,
-    generation_of,
-    matching,
-    stated_instrument,
-)
+from skills.arrays import Floats, frozen, xyz, xyzw
+from skills.demonstration import hypotheses
 from skills.fields import Count, Point, Quaternion, schema
 from skills.kinematics import INSERTION, JAW_TIP_MM, axes_of, check_rotation, matrix_of, quaternion_of
 from skills.quaternions import best_turn
@@ -102,7 +92,7 @@ class Identification:
 
     verdict: Verdict
     instrument: str | None = None
-    generation: Generation | None = None
+    generation: hypotheses.Generation | None = None
     candidates: tuple[str, ...] = ()
     stated: str | None
     in_base: bool
@@ -174,7 +164,7 @@ class _Poses:
         shaft, wrist, turned = axes_of(joints)
         return replace(self, joints=joints, shaft=shaft, wrist=wrist, turned=turned)
 
-    def tips_of(self, one: Hypothesis) -> Floats:
+    def tips_of(self, one: hypotheses.Hypothesis) -> Floats:
         """Return the positions in the base that a hypothesis predicts, mm, shape (T, 3)."""
         depth = self.joints[:, INSERTION : INSERTION + 1] - one.offset_mm
         tip: Floats = depth * self.shaft + one.wrist_mm * self.wrist
@@ -190,7 +180,7 @@ class _Poses:
 class _Fit:
     """A hypothesis with the best transform: position and rotation of the base in the frame of the poses."""
 
-    of: Hypothesis
+    of: hypotheses.Hypothesis
     position_mm: Floats
     rotation: Floats
     away_mm: Floats  # distance of each sample, shape (T,)
@@ -244,7 +234,7 @@ def identify(
     speed = None if speed is None else speed[chosen, :6]
     if turned is not None:
         check_rotation(turned)
-    number = None if stated is None else stated_instrument(stated)
+    number = None if stated is None else hypotheses.stated_instrument(stated)
     if not (np.abs(q) <= _WILD).all() or not (speed is None or (np.abs(speed) <= _WILD).all()):
         reason = "a joint's value or speed is beyond a million rad or mm"
         return Identification(
@@ -271,11 +261,11 @@ def identify(
 
 
 def _fits(poses: _Poses) -> Iterator[_Fit]:
-    for one in HYPOTHESES:
+    for one in hypotheses.HYPOTHESES:
         yield _fit(poses, one)
 
 
-def _without_delay(poses: _Poses, one: Hypothesis) -> _Poses:
+def _without_delay(poses: _Poses, one: hypotheses.Hypothesis) -> _Poses:
     """Take the delay that fits a hypothesis best out of the joints; nothing changes if none up to `LATEST_S` does."""
     assert poses.speeds is not None
     now, step_s = poses, 1e-3
@@ -300,7 +290,7 @@ def _misfit(fit: _Fit) -> float:
     return misfit if isfinite(misfit) else np.inf
 
 
-def _fit(poses: _Poses, one: Hypothesis) -> _Fit:
+def _fit(poses: _Poses, one: hypotheses.Hypothesis) -> _Fit:
     """Fit the transform from the base to the frame of the poses; none if that frame is stated to be the base."""
     tip = poses.tips_of(one)
     if poses.in_base:
@@ -329,7 +319,7 @@ def _turn(poses: _Poses, rotation: Floats) -> float:
 
 def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) -> Identification:
     """Decide among the hypotheses, fitted to some samples, of which the first fits; `best` is fitted to all."""
-    near = [fit for fit in fits if not _is_told_apart(fit, fits[0])]
+    near = [fit for fit in fits if not _is_distinguishable(fit, fits[0])]
     others = [fit for fit in fits if fit not in near]
     if poses.in_base and (moved := _beside_the_base(poses, best)) is not None:
         return moved
@@ -338,7 +328,7 @@ def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) ->
         poses, best, "identified", stood, stated, min((fit.residual_mm for fit in others), default=None)
     )
     names = _describe_candidates(found)
-    if stated in OTHER_WRISTS or (stated in KNOWN and not matching(stood, stated)):
+    if stated in hypotheses.OTHER_WRISTS or (stated in hypotheses.KNOWN and not hypotheses.matching(stood, stated)):
         reason = f"the recording states {stated}, but its joints and poses fit {names}"
         return replace(found, verdict="wrong instrument", reason=reason)
     lengths = np.array([(fit.of.offset_mm, fit.of.wrist_mm) for fit in near])
@@ -348,7 +338,7 @@ def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) ->
     return replace(found, reason=f"joints and poses fit {names}")
 
 
-def _is_told_apart(other: _Fit, best: _Fit) -> bool:
+def _is_distinguishable(other: _Fit, best: _Fit) -> bool:
     """Return whether a hypothesis explains the poses so much worse than the best one that it is not the right one."""
     if not other.is_good:
         return True
@@ -361,7 +351,7 @@ def _is_told_apart(other: _Fit, best: _Fit) -> bool:
 
 def _reaches(joints: Floats, name: str) -> bool:
     """Return whether the arm of an instrument can have these joints."""
-    arm = ARMS[generation_of(name)]
+    arm = hypotheses.ARMS[hypotheses.generation_of(name)]
     beyond = np.array([BEYOND_RAD, BEYOND_RAD, BEYOND_MM])
     low, high = np.array(arm.lower[:3]) - beyond, np.array(arm.upper[:3]) + beyond
     return bool(((joints[:, :3] >= low) & (joints[:, :3] <= high)).all())
@@ -383,33 +373,37 @@ def _wrong_frame(poses: _Poses, free: _Fit) -> Identification:
         f"the poses are stated to be relative to the arm's base, but the joints put the base at ({x:.1f}, {y:.1f}, "
         f"{z:.1f}) mm in their frame, turned by {turn:.1f} degrees"
     )
-    found = _identified(replace(poses, in_base=False), free, "wrong frame", [], None, None)
-    return replace(found, reason=reason, instrument=None, generation=None)
+    return _identified(replace(poses, in_base=False), free, "wrong frame", [], None, reason=reason)
 
 
 def _identified(
-    poses: _Poses, fit: _Fit, verdict: Verdict, names: list[str], stated: str | None, next_mm: float | None
+    poses: _Poses,
+    fit: _Fit,
+    verdict: Verdict,
+    names: list[str],
+    stated: str | None,
+    next_mm: float | None = None,
+    reason: str = "",
 ) -> Identification:
-    preferred = matching(names, stated) if stated is not None else []
+    preferred = hypotheses.matching(names, stated) if stated is not None else []
     candidates = tuple(dict.fromkeys(preferred + names))
     first = candidates[0] if candidates else None
-    x, y, z, w = quaternion_of(fit.rotation[None])[0].tolist()
     return Identification(
         verdict=verdict,
         instrument=first,
-        generation=None if first is None else generation_of(first),
+        generation=None if first is None else hypotheses.generation_of(first),
         candidates=candidates,
         stated=stated,
         in_base=poses.in_base or _is_identity(fit),
         position_mm=xyz(fit.position_mm),
-        rotation_xyzw=(x, y, z, w),
+        rotation_xyzw=xyzw(quaternion_of(fit.rotation[None])[0]),
         residual_mm=fit.residual_mm,
         greatest_mm=float(fit.away_mm.max()),
         residual_rad=None if poses.rotation is None else fit.residual_rad,
         delay_s=poses.delay_s,
         next_mm=next_mm,
         samples=len(poses.tip_mm),
-        reason="",
+        reason=reason,
     )
 
 
@@ -436,16 +430,15 @@ def _not_explained(poses: _Poses, best: _Fit, stated: str | None) -> Identificat
             return replace(_wrong_frame(poses, free), stated=stated)
     elif _fits_in_pieces(poses):
         reason = "each part of the recording fits by itself, but not all together: the frame of the poses moved"
-        found = _identified(poses, best, "moved frame", [], stated, None)
-        return replace(found, reason=reason)
+        return _identified(poses, best, "moved frame", [], stated, reason=reason)
     turn = "" if poses.rotation is None else f" and {np.degrees(best.residual_rad):.1f} degrees"
     reason = (
         "no known arm and instrument puts the tip where the poses have it: the best is off by "
         f"{best.residual_mm:.2f} mm{turn} (root mean square)"
     )
     hint = next((words for words, tried in _explanations(poses) if min(map(_misfit, _fits(tried))) < _BETTER), None)
-    found = _identified(poses, best, "contradiction", [], stated, None)
-    return replace(found, reason=reason if hint is None else f"{reason}; they would agree {hint}")
+    reason = reason if hint is None else f"{reason}; they would agree {hint}"
+    return _identified(poses, best, "contradiction", [], stated, reason=reason)
 
 
 _BETTER = FIT_MM + LEVER_MM * FIT_RAD
@@ -459,7 +452,7 @@ def _fits_in_pieces(poses: _Poses) -> bool:
         return False
     extent = np.concatenate([piece.tip_mm - piece.tip_mm.mean(axis=0) for piece in pieces])
     least_mm = STILL_SHARE * float(np.sqrt((extent**2).sum(axis=1).mean()))
-    for one in HYPOTHESES:
+    for one in hypotheses.HYPOTHESES:
         fits = [_fit(piece, one) for piece in pieces]
         away_mm = float(np.sqrt((np.concatenate([fit.away_mm for fit in fits]) ** 2).mean()))
         # A frame that moves during a piece spoils this piece alone.

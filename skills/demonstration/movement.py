@@ -25,12 +25,13 @@ tap of the pedal is a command to the console and no pause.
 """
 
 from bisect import bisect_left
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from math import pi
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from skills.arithmetic import cos
 from skills.arrays import Flags, Floats, Ints
@@ -160,38 +161,45 @@ def spans_of(seconds: Floats, on: Flags) -> list[Span]:
     Returns:
         Start and end of each interval in s, in order of time.
     """
-    edges = np.diff(np.concatenate(([False], on, [False])).astype(np.int8))
-    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(float(seconds[a]), float(seconds[b])) for a, b in zip(starts, ends, strict=True)]
+    return [(float(seconds[first]), float(seconds[end - 1])) for first, end in runs(on)]
 
 
-def inside(seconds: Floats, spans: list[Span]) -> Flags:
+def runs(on: Flags) -> list[tuple[int, int]]:
+    """Return the first index and the end, exclusive, of each run in which a condition, (N,), holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], on, [False])).astype(np.int8)))
+    return [(first, end) for first, end in edges.reshape(-1, 2).tolist()]
+
+
+def bridged(spans: list[Span], pause_s: float, also: Callable[[float, float], bool] | None = None) -> list[Span]:
+    """Join neighbours whose gap is shorter than a pause.
+
+    Args:
+        spans: Start and end of each interval in s, in order of the starts.
+        pause_s: The shortest gap that divides.
+        also: Return of a longer gap, from its start and its end, whether its neighbours are joined too.
+    """
+    joined: list[Span] = []
+    for start, end in spans:
+        if joined and (start - joined[-1][1] < pause_s or (also and also(joined[-1][1], start))):
+            joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
+        else:
+            joined.append((start, end))
+    return joined
+
+
+def inside(times: NDArray[Any], spans: Iterable[tuple[float, float]]) -> Flags:
     """Return for each time whether it lies in one of the intervals, both ends included.
 
     Args:
-        seconds: Times, shape (N,), increasing.
-        spans: Start and end of each interval in s.
+        times: In s or ns, shape (N,), increasing.
+        spans: Start and end of each interval in the same unit; one without a sample, or that ends before, is empty.
 
     Returns:
         Flags of shape (N,).
     """
-    bounds = np.array(spans, dtype=np.float64).reshape(-1, 2)
-    return covered(
-        len(seconds), np.searchsorted(seconds, bounds[:, 0]), np.searchsorted(seconds, bounds[:, 1], side="right")
-    )
-
-
-def covered(count: int, firsts: Ints, ends: Ints) -> Flags:
-    """Return for each sample whether it lies in one of K slices.
-
-    Args:
-        count: The number of samples, N.
-        firsts: First index of each slice, shape (K,).
-        ends: End index of each slice, exclusive, shape (K,); a slice that ends before it starts is empty.
-
-    Returns:
-        Flags of shape (N,).
-    """
+    # The shape and the type are given because the list may be empty, and floats of nanoseconds are not exact.
+    bounds, count = np.array(list(spans), times.dtype).reshape(-1, 2), len(times)
+    firsts, ends = np.searchsorted(times, bounds[:, 0]), np.searchsorted(times, bounds[:, 1], "right")
     some = firsts < ends
     steps = np.bincount(firsts[some], minlength=count + 1) - np.bincount(ends[some], minlength=count + 1)
     return np.asarray(np.cumsum(steps)[:count] > 0)
@@ -367,10 +375,8 @@ def not_following(recording: Recording, arm: str) -> list[Nanoseconds]:
         return []
     stamps_ns = np.unique(np.concatenate([signal.stamps_ns for signal in signals]))
     stopped = np.all([_not_following_at(signal, stamps_ns) for signal in signals], axis=0)
-    edges = np.diff(np.concatenate(([False], stopped, [False])).astype(np.int8))
     until_ns = np.append(stamps_ns, FOREVER_NS)
-    spans = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
-    return [(int(stamps_ns[a]), int(until_ns[b])) for a, b in spans]
+    return [(int(stamps_ns[first]), int(until_ns[end])) for first, end in runs(stopped)]
 
 
 def undriven(recording: Recording, arm: str) -> list[tuple[int, int, Cause]]:
@@ -406,10 +412,7 @@ def is_driven(stamps_ns: Ints, pauses: list[tuple[int, int, Cause]]) -> Flags:
     Returns:
         Flags of shape (T,).
     """
-    # The shape is given because without pauses the list is empty.
-    bounds_ns = np.array([(start, end) for start, end, _ in pauses], dtype=np.int64).reshape(-1, 2)
-    firsts, ends = np.searchsorted(stamps_ns, bounds_ns[:, 0]), np.searchsorted(stamps_ns, bounds_ns[:, 1], "right")
-    return ~covered(len(stamps_ns), firsts, ends)
+    return ~inside(stamps_ns, ((start, end) for start, end, _ in pauses))
 
 
 def _not_following_at(following: Signal, stamps_ns: Ints) -> Flags:

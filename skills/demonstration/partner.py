@@ -28,8 +28,8 @@ from math import exp
 
 import numpy as np
 
-from skills.arrays import Flags, Floats, freeze, xyz
-from skills.demonstration.movement import Span, same_signs, spans_of
+from skills.arrays import Flags, Floats, freeze, interpolated, nearest, xyz, xyzw
+from skills.demonstration.movement import Span, bridged, same_signs, spans_of
 from skills.demonstration.recording import BaseFrame, Motion, Recording, Signal
 from skills.fields import Point, Quaternion, computed_field, schema
 from skills.kinematics import INSTRUMENTS, matrix_of
@@ -126,7 +126,7 @@ def partner_at(
         if apart_mm <= NEAR_MM:
             base_mm, base_xyzw = (None, None) if base is None else _other_base(base, other.arm, bases)
             tool = _instrument_of(recording, other.arm)
-            pose = xyz(position), _xyzw(rotation)
+            pose = xyz(position), xyzw(rotation)
             near.append((apart_mm, Partner(other.arm, round(second, 6), *pose, base_mm, base_xyzw, tool)))
     return min(near, key=lambda one: one[0])[1] if near else None
 
@@ -152,16 +152,11 @@ def partner_along(
         if other.arm != arm or other.is_local or other.rotation_xyzw is None:
             continue
         stamps_s = recording.seconds(other.stamps_ns)
-        after = np.searchsorted(stamps_s, seconds).clip(1, len(stamps_s) - 1) if len(stamps_s) > 1 else 0
-        before_s, after_s = stamps_s[np.maximum(after - 1, 0)], stamps_s[after]
-        near = np.minimum(np.abs(seconds - before_s), np.abs(seconds - after_s)) <= APART_S
+        near = np.abs(stamps_s[nearest(stamps_s, seconds)] - seconds) <= APART_S
         seen = _in_frame_of(motion, base, other, other.tip_mm, other.rotation_xyzw)
         if seen is None or not near.all():
             continue
-        tip_mm, turned = (
-            np.stack([np.interp(seconds, stamps_s, column) for column in columns.T], axis=1)
-            for columns in (seen[0], same_signs(seen[1]))
-        )
+        tip_mm, turned = (interpolated(seconds, stamps_s, rows) for rows in (seen[0], same_signs(seen[1])))
         return PartnerMotion(arm, tip_mm, turned / np.linalg.norm(turned, axis=1, keepdims=True))
     return None
 
@@ -176,7 +171,7 @@ def in_base(partner: Partner, base: BaseFrame, bases: Sequence[BaseFrame]) -> Pa
     """
     position, rotation = _seen_from(base, np.array(partner.position_mm), np.array(partner.rotation_xyzw))
     base_mm, base_xyzw = _other_base(base, partner.arm, bases) if _is_steady(base) else (None, None)
-    position_mm, rotation_xyzw = xyz(position), _xyzw(rotation)
+    position_mm, rotation_xyzw = xyz(position), xyzw(rotation)
     return replace(partner, position_mm=position_mm, rotation_xyzw=rotation_xyzw, base_mm=base_mm, base_xyzw=base_xyzw)
 
 
@@ -192,10 +187,8 @@ def pose_at(recording: Recording, motion: Motion, second: float) -> int | None:
         Index of the sample; None if no sample is within `APART_S`.
     """
     stamp_ns = recording.origin_ns + round(second * 1e9)
-    after = int(np.searchsorted(motion.stamps_ns, stamp_ns))
-    around = [index for index in (after - 1, after) if 0 <= index < len(motion.stamps_ns)]
-    nearest = min(around, key=lambda index: abs(int(motion.stamps_ns[index]) - stamp_ns))
-    return nearest if abs(int(motion.stamps_ns[nearest]) - stamp_ns) <= APART_S * 1e9 else None
+    index = int(nearest(motion.stamps_ns, np.array([stamp_ns]))[0])
+    return index if abs(int(motion.stamps_ns[index]) - stamp_ns) <= APART_S * 1e9 else None
 
 
 def _base_of(motion: Motion, bases: Sequence[BaseFrame]) -> BaseFrame | None:
@@ -211,7 +204,7 @@ def _other_base(base: BaseFrame, arm: str, bases: Sequence[BaseFrame]) -> tuple[
     for one in bases:
         if (one.arm, one.frame) == (arm, base.frame) and _is_steady(one):
             position, rotation = _seen_from(base, np.array(one.position_mm), np.array(one.rotation_xyzw))
-            return xyz(position), _xyzw(rotation)
+            return xyz(position), xyzw(rotation)
     return None, None
 
 
@@ -241,11 +234,6 @@ def _seen_from(base: BaseFrame, position_mm: Floats, rotation_xyzw: Floats) -> t
     """Transform one pose from the frame in which a base stands into the base's own frame."""
     position, rotation = base.seen_from(position_mm[None], rotation_xyzw[None])
     return position[0], rotation[0]
-
-
-def _xyzw(values: Floats) -> Quaternion:
-    x, y, z, w = values.tolist()
-    return x, y, z, w
 
 
 JAW_RANGE_RAD = 0.2  # a jaw that moves less never opened
@@ -304,14 +292,7 @@ def closed_jaw(recording: Recording, arm: str) -> list[Span] | None:
     least, most = np.quantile(jaw.values, (EXTREME, 1.0 - EXTREME)).tolist()
     if most - least < JAW_RANGE_RAD:
         return None
-    spans = spans_of(recording.seconds(jaw.stamps_ns), _closed(jaw, least, most))
-    joined: list[Span] = []
-    for start, end in spans:
-        if joined and start - joined[-1][1] < REGRIP_S:
-            joined[-1] = (joined[-1][0], end)
-        else:
-            joined.append((start, end))
-    return joined
+    return bridged(spans_of(recording.seconds(jaw.stamps_ns), _closed(jaw, least, most)), REGRIP_S)
 
 
 def _closed(jaw: Signal, least: float, most: float) -> Flags:
@@ -402,13 +383,13 @@ def _observed(recording: Recording, one: _Overlap, bases: Sequence[BaseFrame]) -
     after_s = np.linspace(one.released_s, min(one.until_s, one.released_s + AFTER_S), LOOKS)
     giver, taker = (recording.motion_of(arm=arm) for arm in (one.giver, one.taker))
     seconds = np.concatenate([both_s, after_s])
-    here_mm = _at(recording.seconds(giver.stamps_ns), giver.tip_mm, seconds)
+    here_mm = interpolated(seconds, recording.seconds(giver.stamps_ns), giver.tip_mm)
     parted_mm = float(np.linalg.norm(here_mm[LOOKS:] - here_mm[LOOKS], axis=1).max())
     other = partner_along(recording, giver, both_s, bases, one.taker)
     if other is not None:
         apart_mm = np.linalg.norm(other.tip_mm - here_mm[:LOOKS], axis=1)
         return _Observed(one, float(np.ptp(apart_mm)), parted_mm, float(apart_mm.mean()))
-    there_mm = _at(recording.seconds(taker.stamps_ns), taker.tip_mm, both_s)
+    there_mm = interpolated(both_s, recording.seconds(taker.stamps_ns), taker.tip_mm)
     ways_mm = [np.linalg.norm(tip_mm - tip_mm[0], axis=1) for tip_mm in (here_mm[:LOOKS], there_mm)]
     return _Observed(one, float(np.abs(ways_mm[0] - ways_mm[1]).max()), parted_mm, None)
 
@@ -418,7 +399,3 @@ def _usual_mm(seen: Sequence[_Observed]) -> float | None:
     clear = [one.apart_mm for one in seen if one.slip_mm < CLEAR_SLIP_MM and one.parted_mm > CLEAR_PARTED_MM]
     known = [apart_mm for apart_mm in clear if apart_mm is not None]
     return float(np.median(known)) if known else None
-
-
-def _at(stamps_s: Floats, tip_mm: Floats, seconds: Floats) -> Floats:
-    return np.stack([np.interp(seconds, stamps_s, axis) for axis in tip_mm.T], axis=1)

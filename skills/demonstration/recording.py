@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from skills.arithmetic import product
-from skills.arrays import Floats, Ints
+from skills.arrays import Floats, Ints, nearest, xyz, xyzw
 from skills.demonstration.hypotheses import stated_instrument
 from skills.demonstration.identification import MOST_SAMPLES, ArmIdentification, Identification, identify
 from skills.demonstration.motion import Joints as Joints
@@ -202,14 +202,12 @@ def _base_frame(local: Motion, other: Motion) -> BaseFrame | None:
     places = other.tip_mm[there] - turned(turn, local.tip_mm[here])
     place = np.median(places, axis=0)
     spread_rad = float(angle_of(multiplied(turns, turn * INVERSE)).max())
-    x, y, z = place.tolist()
-    qx, qy, qz, qw = turn.tolist()
     return BaseFrame(
         arm=local.arm,
         frame=other.frame,
         local_frame=local.frame,
-        position_mm=(x, y, z),
-        rotation_xyzw=(qx, qy, qz, qw),
+        position_mm=xyz(place),
+        rotation_xyzw=xyzw(turn),
         spread_mm=float(np.linalg.norm(places - place, axis=1).max()),
         spread_rad=spread_rad,
     )
@@ -237,10 +235,7 @@ def _pairs(stamps_ns: Ints, others_ns: Ints) -> tuple[Ints, Ints]:
     if np.array_equal(stamps_ns, others_ns):  # columns of one table
         every = np.arange(len(stamps_ns))
         return every, every
-    after = np.clip(np.searchsorted(others_ns, stamps_ns), 1, max(1, len(others_ns) - 1))
-    before = after - 1
-    after = np.minimum(after, len(others_ns) - 1)
-    nearer = np.where(stamps_ns - others_ns[before] <= others_ns[after] - stamps_ns, before, after)
+    nearer = nearest(others_ns, stamps_ns)
     near = np.flatnonzero(np.abs(others_ns[nearer] - stamps_ns) <= PAIR_NS)
     return near, nearer[near]
 

@@ -33,6 +33,7 @@ recording's other candidates is hand-work (M1, M2): steadying tissue, reaching.
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice, pairwise
 from typing import Literal
 
@@ -43,6 +44,7 @@ from skills.demonstration.movement import (
     TURNING_RAD_S,
     Movement,
     Span,
+    bridged,
     inside,
     movement_of,
     offset,
@@ -246,7 +248,8 @@ def _moved(seen: "_Analysed") -> tuple[Segment, ...]:
         held = _without_hand_work(seen, _movements_in_hold(seen, seen.holding))
         return tuple(_propose(seen, span, "jaw") for span in held[:PROPOSALS_LIMIT])
     turned = [span for span in _strokes(seen) if _ends_with_a2(seen, span)]
-    spans = turned or [span for span in _bridged(_listed(seen.moving), PAUSE_S, seen) if _is_a_pass(seen, span)]
+    drawn = bridged(_listed(seen.moving), PAUSE_S, partial(_mostly_paused, seen))
+    spans = turned or [span for span in drawn if _is_a_pass(seen, span)]
     return tuple(_propose(seen, span, "motion") for span in _without_hand_work(seen, spans)[:PROPOSALS_LIMIT])
 
 
@@ -309,7 +312,7 @@ def _analyse(shared: _Shared, motion: Motion) -> _Analysed:
         motion=motion,
         movement=movement,
         strokes=_spans(strokes),
-        moving=_spans(_bridged(sorted(strokes + turns), 0.0)),
+        moving=_spans(bridged(sorted(strokes + turns), 0.0)),
         holding=shared.holding[motion.arm],
         closes={arm: spans for arm, spans in shared.holding.items() if spans is not None and arm != motion.arm},
         paused_s=np.append(0.0, np.cumsum(np.diff(movement.seconds) * (halted[1:] & halted[:-1]))),
@@ -325,7 +328,7 @@ def _movements(movement: Movement, speed: Floats, least: float, driven: Flags) -
         for start, end in spans_of(seconds, (speed > least) & driven)
     ]
     # Onset and offset extend the movements, so that neighbours may overlap.
-    apart = _bridged(sorted(span for span in spans if span[0] < span[1]), 0.0)  # a movement of one sample is left out
+    apart = bridged(sorted(span for span in spans if span[0] < span[1]), 0.0)  # a movement of one sample is left out
     return _within(_spans(apart), whole)
 
 
@@ -337,7 +340,7 @@ def _movements_in_hold(seen: _Analysed, holding: Spans) -> list[Span]:
     spans = [
         _exact(seen, group)
         for hold in _listed(holding)
-        for group in _bridged(_within(seen.moving, hold), HELD_PAUSE_S, seen)
+        for group in bridged(_within(seen.moving, hold), HELD_PAUSE_S, partial(_mostly_paused, seen))
     ]
     return [span for span in spans if _is_a_pass(seen, span)]
 
@@ -348,7 +351,7 @@ def _last_held(seen: _Analysed, given: Mapping[float, NeedleTransfer]) -> list[t
     found = []
     for hold in _listed(seen.holding):
         if (transfer := given.get(hold[1])) is not None:
-            groups = _bridged(_within(seen.moving, hold), HELD_PAUSE_S, seen)
+            groups = bridged(_within(seen.moving, hold), HELD_PAUSE_S, partial(_mostly_paused, seen))
             passes = [span for span in (_exact(seen, group) for group in groups) if _is_a_pass(seen, span)]
             found += [(span, transfer) for span in passes[-1:]]
     return found
@@ -359,7 +362,7 @@ def _strokes(seen: _Analysed) -> list[Span]:
     whole = (float(seen.movement.seconds[0]), float(seen.movement.seconds[-1]))
     bounds = [whole[0], *(end for _, end in _turns_in_place(seen)), whole[1]]
     parts = [_within(seen.moving, part) for part in pairwise(bounds) if part[0] < part[1]]
-    groups = [group for part in parts for group in _bridged(part, STROKE_PAUSE_S, seen)]
+    groups = [group for part in parts for group in bridged(part, STROKE_PAUSE_S, partial(_mostly_paused, seen))]
     spans = [_exact(seen, group) for group in groups]
     return [span for span in spans if _is_a_pass(seen, span)]
 
@@ -367,7 +370,7 @@ def _strokes(seen: _Analysed) -> list[Span]:
 def _turns_in_place(seen: _Analysed) -> list[Span]:
     m = seen.movement
     spans = spans_of(m.seconds, (m.turning_rad_s > TURNING_RAD_S) & (m.speed_mm_s < 2.0 * m.moving_mm_s))
-    return [span for span in _bridged(spans, REGRIP_S) if m.turn_rad(*span) >= A2_RAD]
+    return [span for span in bridged(spans, REGRIP_S) if m.turn_rad(*span) >= A2_RAD]
 
 
 def _exact(seen: _Analysed, group: Span) -> Span:
@@ -406,18 +409,8 @@ def _ends_with_a2(seen: _Analysed, span: Span) -> bool:
     return after >= A2_RAD and before <= A1_SHARE * after
 
 
-def _bridged(spans: list[Span], pause_s: float, seen: _Analysed | None = None) -> list[Span]:
-    """Join neighbours whose gap is shorter than `pause_s`, or in whose gap the arm was mostly not driven."""
-    joined: list[Span] = []
-    for start, end in spans:
-        if joined and (start - joined[-1][1] < pause_s or (seen and _mostly_paused(seen, joined[-1][1], start))):
-            joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
-        else:
-            joined.append((start, end))
-    return joined
-
-
 def _mostly_paused(seen: _Analysed, start: float, end: float) -> bool:
+    """Return whether the arm was not driven for most of a gap, which then ends no pass."""
     paused_s = seen.paused_s[seen.movement.index(end)] - seen.paused_s[seen.movement.index(start)]
     return bool(paused_s >= PAUSED_SHARE * (end - start))
 

@@ -16,7 +16,7 @@ If there is a `metadata.yaml`, it must name exactly these files and count exactl
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
@@ -213,11 +213,16 @@ def _read_bag(archive: Archive, names: list[str], bag: list[str]) -> Recording:
     described = str(PurePosixPath(folders[0]) / METADATA)
     metadata = read_metadata(archive.text(described)) if described in names else None
     ordered = in_order(bag, metadata)
-    recording = _READERS[suffixes[0]](archive, ordered)
+    suffix: Suffix = ".bag" if suffixes == [".bag"] else ".db3"
+    with ExitStack() as files:
+        if suffixes[0].startswith(".mcap"):
+            recording = _read_mcaps(archive, ordered)
+        else:
+            recording = read_rosbag([files.enter_context(archive.unpacked(name)) for name in ordered], suffix)
     if metadata is not None:
         check_counts(metadata, recording.topics)
     labels = read_labels(dict(_tags(archive, names)))
-    kind: Format = "rosbag1" if suffixes[0] == ".bag" else "rosbag2"
+    kind: Format = "rosbag1" if suffix == ".bag" else "rosbag2"
     # "full", because a zip archive has a checksum (CRC-32) of every file in it
     return replace(recording, format=kind, integrity="full", labels=in_time((*recording.labels, *labels)))
 
@@ -236,22 +241,6 @@ def _read_mcaps(archive: Archive, names: list[str]) -> Recording:
                     f"{shown(name)}, a part of the bag: {error.message}", *error.remedies, Remedy(Action.JOIN_BAG)
                 ) from error
     return join(sorted(parts, key=lambda part: part.origin_ns))  # without metadata, names do not give the order
-
-
-def _through_rosbags(suffix: Suffix) -> Callable[[Archive, list[str]], Recording]:
-    def read(archive: Archive, names: list[str]) -> Recording:
-        with ExitStack() as files:
-            return read_rosbag([files.enter_context(archive.unpacked(name)) for name in names], suffix)
-
-    return read
-
-
-_READERS: dict[str, Callable[[Archive, list[str]], Recording]] = {
-    ".mcap": _read_mcaps,
-    ".mcap.zstd": _read_mcaps,
-    ".db3": _through_rosbags(".db3"),
-    ".bag": _through_rosbags(".bag"),
-}
 
 
 @contextmanager

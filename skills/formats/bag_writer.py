@@ -27,7 +27,7 @@ import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import IO
+from typing import IO, Self
 
 import numpy as np
 from jinja2 import Template
@@ -62,29 +62,18 @@ class Message:
     data: bytes
 
 
-def pose(
-    topic: str,
-    stamp_ns: int,
-    frame: str,
-    place_m: Sequence[float],
-    turn_xyzw: Sequence[float],
-    *,
-    log_ns: int | None = None,
-) -> Message:
+def pose(topic: str, stamp_ns: int, frame: str, place_m: Sequence[float], turn_xyzw: Sequence[float]) -> Message:
     """Return a PoseStamped message.
 
     Args:
         topic: The topic.
-        stamp_ns: Stamp of the header.
+        stamp_ns: Stamp of the header, and log time; the same for the functions below.
         frame: Frame of the header.
         place_m: Position, 3 numbers.
         turn_xyzw: Unit quaternion, 4 numbers.
-        log_ns: Log time, by default the stamp; the same for the functions below.
     """
-    body = _Body()
-    body.header(stamp_ns, frame)
-    body.put("7d", *place_m, *turn_xyzw)
-    return Message(stamp_ns if log_ns is None else log_ns, topic, POSE, bytes(body.data))
+    body = _Body().header(stamp_ns, frame).put("7d", *place_m, *turn_xyzw)
+    return Message(stamp_ns, topic, POSE, bytes(body.data))
 
 
 def joint_state(
@@ -95,83 +84,63 @@ def joint_state(
     *,
     velocities: Sequence[float] = (),
     frame: str = "",
-    log_ns: int | None = None,
 ) -> Message:
     """Return a JointState message with positions in rad or m, optional velocities, and no efforts."""
-    body = _Body()
-    body.header(stamp_ns, frame)
-    body.put("I", len(names))
+    body = _Body().header(stamp_ns, frame).put("I", len(names))
     for name in names:
         body.text(name)
-    body.numbers("d", positions)
-    body.numbers("d", velocities)
-    body.numbers("d", ())
-    return Message(stamp_ns if log_ns is None else log_ns, topic, JOINT_STATE, bytes(body.data))
+    body.numbers("d", positions).numbers("d", velocities).numbers("d", ())
+    return Message(stamp_ns, topic, JOINT_STATE, bytes(body.data))
 
 
-def joy(topic: str, stamp_ns: int, buttons: Sequence[int], *, frame: str = "", log_ns: int | None = None) -> Message:
+def joy(topic: str, stamp_ns: int, buttons: Sequence[int], *, frame: str = "") -> Message:
     """Return a Joy message with a pedal's state: `buttons[0]` is 0 released, 1 pressed, 2 a quick tap."""
-    body = _Body()
-    body.header(stamp_ns, frame)
-    body.numbers("f", ())
-    body.numbers("i", buttons)
-    return Message(stamp_ns if log_ns is None else log_ns, topic, JOY, bytes(body.data))
+    body = _Body().header(stamp_ns, frame).numbers("f", ()).numbers("i", buttons)
+    return Message(stamp_ns, topic, JOY, bytes(body.data))
 
 
 def boolean(topic: str, log_ns: int, value: bool) -> Message:
     """Return a Bool message, which has no stamp."""
-    body = _Body()
-    body.put("?", value)
-    return Message(log_ns, topic, BOOL, bytes(body.data))
+    return Message(log_ns, topic, BOOL, bytes(_Body().put("?", value).data))
 
 
 def number(topic: str, log_ns: int, value: float) -> Message:
     """Return a Float64 message, which has no stamp."""
-    body = _Body()
-    body.put("d", value)
-    return Message(log_ns, topic, FLOAT64, bytes(body.data))
+    return Message(log_ns, topic, FLOAT64, bytes(_Body().put("d", value).data))
 
 
 def text(topic: str, log_ns: int, value: str) -> Message:
     """Return a String message, which has no stamp."""
-    body = _Body()
-    body.text(value)
-    return Message(log_ns, topic, STRING, bytes(body.data))
+    return Message(log_ns, topic, STRING, bytes(_Body().text(value).data))
 
 
 class _Body:
-    """A builder of a message's bytes."""
+    """A builder of a message's bytes; each method appends, and returns the builder."""
 
     def __init__(self) -> None:
         self.data = bytearray(b"\x00\x01\x00\x00")  # plain CDR, little-endian
 
-    def put(self, code: str, *values: float) -> None:
+    def put(self, code: str, *values: float) -> Self:
         """Append numbers of one size, aligned to it."""
         size = struct.calcsize(code[-1])
         self.data.extend(bytes(-(len(self.data) - 4) % size))  # aligned from the end of the header
         self.data += struct.pack("<" + code, *values)
+        return self
 
-    def text(self, value: str) -> None:
+    def text(self, value: str) -> Self:
         """Append a string."""
         data = value.encode() + b"\0"
-        self.put("I", len(data))
-        self.data += data
+        self.put("I", len(data)).data.extend(data)
+        return self
 
-    def numbers(self, code: str, values: Sequence[float]) -> None:
+    def numbers(self, code: str, values: Sequence[float]) -> Self:
         """Append a sequence: its length, then its elements."""
         self.put("I", len(values))
-        if values:
-            self.put(f"{len(values)}{code}", *values)
+        return self.put(f"{len(values)}{code}", *values) if values else self
 
-    def header(self, stamp_ns: int, frame: str) -> None:
+    def header(self, stamp_ns: int, frame: str) -> Self:
         """Append a std_msgs/Header."""
-        self.put("i", stamp_ns // _NANO)
-        self.put("I", stamp_ns % _NANO)
-        self.text(frame)
-
-
-_LIBRARY = "suture-skills"
-_QOS = "offered_qos_profiles"
+        return self.put("i", stamp_ns // _NANO).put("I", stamp_ns % _NANO).text(frame)
 
 
 @dataclass
@@ -220,7 +189,7 @@ def write_messages(
         definitions: The ros2msg definition of each message type.
     """
     writer, written = Writer(file), Written()
-    writer.start(profile="ros2", library=_LIBRARY)
+    writer.start(profile="ros2", library="suture-skills")
     schemas: dict[str, int] = {}
     channels: dict[tuple[str, str], int] = {}
     if notes:
@@ -231,7 +200,8 @@ def write_messages(
             definition = definitions[message.type].encode()
             schemas[message.type] = writer.register_schema(message.type, "ros2msg", definition)
         if key not in channels:
-            channels[key] = writer.register_channel(message.topic, "cdr", schemas[message.type], {_QOS: "[]"})
+            profiles = {"offered_qos_profiles": "[]"}
+            channels[key] = writer.register_channel(message.topic, "cdr", schemas[message.type], profiles)
         writer.add_message(channels[key], message.log_ns, message.data, message.log_ns, written.count(message))
     writer.finish()  # type: ignore[no-untyped-call]
     return written

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TextIO
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, TextIO
 
 import numpy as np
 
@@ -45,6 +45,24 @@ _NUMPY = re.compile(r"np\.float64\(([^(),;\t\n]*)\)")
 _NUMPY_BYTES = re.compile(_NUMPY.pattern.encode())
 _DECIMAL = r"^-?[0-9]{1,19}(\.[0-9]{0,9})?$"
 _FIRST_ROW = 2  # the header is row 1
+
+
+class TableLayout(NamedTuple):
+    """How a table is written, and what of it is read.
+
+    Attributes:
+        names: The names of all columns.
+        groups: The indices of the columns to read, in groups of at least one.
+        separator: The character between two cells.
+        decimal: The decimal mark.
+        time: The index of the column with times, a group of its own, and its unit: one of `NS_PER`.
+    """
+
+    names: Sequence[str]
+    groups: Sequence[Sequence[int]]
+    separator: str = ","
+    decimal: Decimals = "point"
+    time: tuple[int, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -186,23 +204,12 @@ def check_last_number(file: BinaryIO, separator: str, decimal: Decimals) -> None
         )
 
 
-def read_numbers(
-    text: TextIO,
-    names: Sequence[str],
-    groups: Sequence[Sequence[int]],
-    separator: str = ",",
-    decimal: Decimals = "point",
-    time: tuple[int, str] | None = None,
-) -> ParsedNumbers:
+def read_numbers(text: TextIO, layout: TableLayout) -> ParsedNumbers:
     """Read the rows of a table below its first line, which is the header.
 
     Args:
         text: The whole table, wherever it is positioned, as `open_text` opens it.
-        names: The names of all columns, for messages.
-        groups: The indices of the columns to read, in groups of at least one.
-        separator: The character between two cells.
-        decimal: The decimal mark.
-        time: The index of the column with times, a group of its own, and its unit: one of `NS_PER`.
+        layout: Its columns.
 
     Raises:
         UnreadableRecording: A row of another length, a cell that is not a number, too many rows, or none.
@@ -210,14 +217,15 @@ def read_numbers(
         BadColumns: A time is beyond the year 2096.
     """
     # Typed as `TextIO`, but `open_text` makes it a wrapper of the file.
-    numbers = _plain_numbers(text.buffer, len(names), groups, separator, decimal, time)
+    numbers = _plain_numbers(text.buffer, layout)
     if numbers is None:
         text.seek(0)
         next(_lines(text, 1))  # the header
-        numbers = _any_numbers(text, names, groups, separator, decimal, time)
-    _check_finite(names, groups, numbers.groups)
-    if time is not None:
-        _check_early(names[time[0]], time[1], numbers.groups[list(groups).index([time[0]])][:, 0])
+        numbers = _any_numbers(text, layout)
+    _check_finite(layout, numbers.groups)
+    if layout.time is not None:
+        column, unit = layout.time
+        _check_early(layout.names[column], unit, numbers.groups[list(layout.groups).index([column])][:, 0])
     return numbers
 
 
@@ -230,24 +238,17 @@ class _NotPlain(Exception):
     """Rows that `_any_numbers` reads or refuses."""
 
 
-def _plain_numbers(
-    file: BinaryIO,
-    columns: int,
-    groups: Sequence[Sequence[int]],
-    separator: str,
-    decimal: Decimals,
-    time: tuple[int, str] | None,
-) -> ParsedNumbers | None:
+def _plain_numbers(file: BinaryIO, layout: TableLayout) -> ParsedNumbers | None:
     """Read a table whose rows are plain with Arrow's parser, in a tenth of the time; None for any other table.
 
     Arrow accepts no finite number that Python does not, and then the same one. Its reader of CSV files starts threads,
     which a reader's process may not; its conversion of texts does not. The rows are counted first, so that each number
-    is stored once, where it stays: to map new memory takes as long as to parse. Arguments are those of `read_numbers`,
-    and the table's file.
+    is stored once, where it stays: to map new memory takes as long as to parse.
     """
     from pyarrow import ArrowInvalid, compute, float64  # here, because most processes never need it
 
-    used = sorted({index for group in groups for index in group})
+    names, groups, separator, decimal, time = layout
+    columns, used = len(names), sorted({index for group in groups for index in group})
     place = {column: k for k, column in enumerate(used)}
     picks = [_as_slice([place[column] for column in group]) for group in groups]
     most = _most_rows(file, columns + len(used))
@@ -362,15 +363,9 @@ def _stamps(texts: Any, ns_per_unit: int) -> Ints:
     return np.minimum(words[:, 0], _LATEST_S * 1_000_000_000)  # `_check_early` refuses those that need both words
 
 
-def _any_numbers(
-    text: TextIO,
-    names: Sequence[str],
-    groups: Sequence[Sequence[int]],
-    separator: str,
-    decimal: Decimals,
-    time: tuple[int, str] | None,
-) -> ParsedNumbers:
+def _any_numbers(text: TextIO, layout: TableLayout) -> ParsedNumbers:
     """Read the rows one by one; arguments and errors are those of `read_numbers`."""
+    names, groups, separator, decimal, time = layout
     used = [index for group in groups for index in group]
     rows = csv_rows(text, first_line=_FIRST_ROW, separator=separator)
     cells, stamps_ns, count, blank_line = array("d"), array("q"), 0, 0
@@ -441,15 +436,15 @@ def _no_number(names: Sequence[str], used: Sequence[int], cells: list[str], line
     return UnreadableRecording(f"{where}: not a number; export the table again.", row=line, column=names[k])
 
 
-def _check_finite(names: Sequence[str], groups: Sequence[Sequence[int]], found: Sequence[Floats]) -> None:
+def _check_finite(layout: TableLayout, found: Sequence[Floats]) -> None:
     wrong = list[tuple[int, int]]()
-    for group, values in zip(groups, found, strict=True):
+    for group, values in zip(layout.groups, found, strict=True):
         if not (finite := np.isfinite(values)).all():
             row, column = np.argwhere(~finite)[0].tolist()
             wrong.append((row + _FIRST_ROW, group[column]))
     if wrong:
         line, column = min(wrong)
-        name = names[column]
+        name = layout.names[column]
         raise NotFinite(f"Row {line}, column {name}: NaN or infinity; cut the row.", row=line, column=name)
 
 

@@ -9,7 +9,6 @@ arm lags behind. No fault of a setpoint refuses a recording, because nothing is 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +46,7 @@ Parts = tuple[Floats, ...]
 _TURN_RAD = 2 * np.pi
 _JOINT_RAD = 7.0  # ours: more than any joint turns, less than 8 degrees
 APART_MM = 30.0  # ours: an arm lags by some mm, and by a cell of the paper's grid, 5 mm, at 100 mm/s and 50 ms
+NEAR_SAMPLES = 10_000  # ours: enough for a median, however long the recording is
 
 
 def scaled(values: Floats, factor: float) -> Floats:
@@ -217,24 +217,9 @@ def quaternion_of_vector(topic: str, vector_rad: Floats) -> Floats:
     return of_vector(vector_rad)
 
 
-@dataclass(frozen=True)
-class ColumnSetpoints:
-    """The setpoints in the columns of one file.
-
-    Attributes:
-        tips: Commanded poses of tips.
-        jaws: Arm and the commanded angle of its jaw.
-        left_out: Topics that were not usable, and the fault of each.
-    """
-
-    tips: list[Motion] = field(default_factory=list)
-    jaws: list[tuple[str, Signal]] = field(default_factory=list)
-    left_out: list[tuple[str, str]] = field(default_factory=list)
-
-
 def setpoints_in(
     values: Mapping[Quantity, Parts], motions: Sequence[Motion], instruments: Mapping[str, str], stamps_ns: Ints
-) -> ColumnSetpoints:
+) -> tuple[list[Motion], list[tuple[str, Signal]], list[tuple[str, str]]]:
     """Return the setpoints beside measured poses in the same frame; those of joints in the base of their arm.
 
     Args:
@@ -242,33 +227,38 @@ def setpoints_in(
         motions: The measured motions.
         instruments: The number of each arm's instrument, where it is known.
         stamps_ns: Integer nanoseconds, shape (T,).
+
+    Returns:
+        Commanded poses of tips; arms and the commanded angles of their jaws; and topics that were not usable, with the
+        fault of each.
     """
-    found = ColumnSetpoints()
+    tips, jaws, left_out = list[Motion](), list[tuple[str, Signal]](), list[tuple[str, str]]()
     for (arm, kind), parts in values.items():
         if kind not in SETPOINTS:
             continue
-        topic, pose = topic_of(arm, kind), parts
+        pose = parts
         if kind == "joint_setpoints":
             number = instruments.get(arm)
             if (arm, "local_setpoint") in values or number is None or not np.isfinite(parts[0]).all():
                 why = "not used: the instrument is not known, a number is NaN or infinite, or poses are there too"
-                found.left_out.append((topic, why))
+                left_out.append((topic_of(arm, kind), why))
                 continue
-            topic, pose = topic_of(arm, "local_setpoint"), pose_of(parts[0], number)
+            kind, pose = "local_setpoint", pose_of(parts[0], number)
+        topic = topic_of(arm, kind)
         try:
             if kind == "jaw_setpoint":
-                found.jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
+                jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
                 continue
             beside = topic_of(arm, "pose" if kind == "setpoint" else "local_pose")
             measured = next((one for one in motions if one.topic == beside), None)
             if measured is None:
                 raise NoUsableTopic(f"{arm} has no measured pose beside it in a known frame.")
-            tip = replace(pose_motion(arm, kind, measured.frame, stamps_ns, pose), topic=topic)
+            tip = pose_motion(arm, kind, measured.frame, stamps_ns, pose)
             _check_near(tip, measured)
-            found.tips.append(tip)
+            tips.append(tip)
         except SkillsError as error:
-            found.left_out.append((topic, str(error)))
-    return found
+            left_out.append((topic, str(error)))
+    return tips, jaws, left_out
 
 
 def pose_of(joints: Floats, instrument: str) -> Parts:
@@ -283,9 +273,10 @@ def _check_near(tip: Motion, measured: Motion) -> None:
     Raises:
         MixedFrames: Their median distance is above `APART_MM`.
     """
+    step = 1 + len(tip.stamps_ns) // NEAR_SAMPLES
     # samples may have been dropped from either
-    _, here, there = np.intersect1d(tip.stamps_ns, measured.stamps_ns, assume_unique=True, return_indices=True)
-    away_mm = np.linalg.norm(tip.tip_mm[here] - measured.tip_mm[there], axis=1)
+    _, here, there = np.intersect1d(tip.stamps_ns[::step], measured.stamps_ns, assume_unique=True, return_indices=True)
+    away_mm = np.linalg.norm(tip.tip_mm[::step][here] - measured.tip_mm[there], axis=1)
     far_mm = float(np.median(away_mm)) if len(away_mm) else np.nan
     if not far_mm <= APART_MM:
         raise MixedFrames(

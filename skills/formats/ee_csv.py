@@ -29,20 +29,9 @@ from typing import BinaryIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import (
-    WIDE_MM,
-    Column,
-    Joints,
-    Motion,
-    Recording,
-    Signal,
-    Topic,
-    base_frames,
-    recorded_joints,
-    recorded_signal,
-)
+from skills.demonstration import recording
 from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
-from skills.formats.cells import check_whole, header_of, open_text, read_numbers
+from skills.formats import cells
 from skills.formats.columns import (
     BASE,
     POSE_PARTS,
@@ -91,7 +80,7 @@ def is_header(names: Iterable[str]) -> bool:
     return any(_FIRST.fullmatch(name) for name in names)
 
 
-def read_ee_csv(file: BinaryIO, options: ReadingOptions) -> Recording:
+def read_ee_csv(file: BinaryIO, options: ReadingOptions) -> recording.Recording:
     """Read the motions of all arms.
 
     Args:
@@ -112,9 +101,9 @@ def read_ee_csv(file: BinaryIO, options: ReadingOptions) -> Recording:
         raise BadSettings("The columns name their arms; omit table_arm.")
     if options.unit:
         raise BadSettings("The columns of an ee_csv are in m, rad and ns; omit unit, or map the columns of one arm.")
-    check_whole(file)
-    with open_text(file) as text:
-        names, _ = header_of(text)
+    cells.check_whole(file)
+    with cells.open_text(file) as text:
+        names, _ = cells.header_of(text)
     groups, faults = _groups(names)
     if names.count(TIME) > 1:
         raise _doubled(TIME)
@@ -137,11 +126,12 @@ def _read(
 ) -> tuple[Ints, dict[Quantity, Parts]]:
     """Return the stamps, shape (T,), and the numbers of each quantity."""
     file.seek(0)
-    with open_text(file) as text:
-        names, separator = header_of(text)
+    with cells.open_text(file) as text:
+        names, separator = cells.header_of(text)
         apart = {one: [columns] if one[1] in _PARTS else [columns[:3], columns[3:]] for one, columns in groups.items()}
         used = [*([[time]] if time is not None else []), *(list(part) for parts in apart.values() for part in parts)]
-        numbers = read_numbers(text, names, used, separator, options.decimal, None if time is None else (time, "ns"))
+        at = None if time is None else (time, "ns")
+        numbers = cells.read_numbers(text, cells.TableLayout(names, used, separator, options.decimal, at))
     found = iter(numbers.groups)
     if time is not None:
         _check_whole(next(found))
@@ -202,13 +192,15 @@ def _doubled(name: str) -> BadColumns:
     return BadColumns(f"The table has the column {name!r} twice; export the table again.", doubled=[name])
 
 
-def _columns(names: Sequence[str], groups: Mapping[Quantity, Indices], time: int | None) -> tuple[Column, ...]:
+def _columns(
+    names: Sequence[str], groups: Mapping[Quantity, Indices], time: int | None
+) -> tuple[recording.Column, ...]:
     meant = {} if time is None else {time: ("t", "ns")}
     for (arm, kind), columns in groups.items():
         for index, part in zip(columns, _PARTS.get(kind, _POSE), strict=True):
             unit = "m" if part in POSITION or part == JOINT_NAMES[INSERTION] else "" if part in QUATERNION else "rad"
             meant[index] = (f"{arm} {_PLACES.get(kind, '')}{part}", unit)
-    return tuple(Column(name, *meant.get(index, ("", ""))) for index, name in enumerate(names))
+    return tuple(recording.Column(name, *meant.get(index, ("", ""))) for index, name in enumerate(names))
 
 
 def _check_whole(times: Floats) -> None:
@@ -224,12 +216,12 @@ def _recording(
     values: Mapping[Quantity, Parts],
     stamps_ns: Ints,
     options: ReadingOptions,
-    columns: tuple[Column, ...],
+    columns: tuple[recording.Column, ...],
     faults: Mapping[str, str],
-) -> Recording:
-    motions: list[Motion] = []
-    joints: list[Joints] = []
-    jaws: list[tuple[str, Signal]] = []
+) -> recording.Recording:
+    motions: list[recording.Motion] = []
+    joints: list[recording.Joints] = []
+    jaws: list[tuple[str, recording.Signal]] = []
     left_out: list[tuple[str, str]] = list(faults.items())
     posing = [arm for (arm, kind), parts in values.items() if kind == "pose" and any(part.any() for part in parts)]
     for (arm, kind), parts in values.items():
@@ -237,13 +229,13 @@ def _recording(
         if kind == "joints":
             (positions,) = parts
             check_joints(topic, positions)
-            joints.append(recorded_joints(arm, topic, stamps_ns, positions))
+            joints.append(recording.recorded_joints(arm, topic, stamps_ns, positions))
             if (arm, "pose") not in values:
                 pose = posed(topic, positions, options.instrument)
                 computed = pose_motion(arm, kind, base_of(arm, options.frame), stamps_ns, pose)
                 motions.append(replace(computed, from_joints=True))
         elif kind == "jaw":
-            jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
+            jaws.append((arm, recording.recorded_signal(stamps_ns, parts[0][:, 0], topic)))
         elif kind == "pose" and arm in posing:
             motions.append(pose_motion(arm, kind, _frame(arm, posing, options), stamps_ns, parts))
         elif kind == "pose":
@@ -259,22 +251,22 @@ def _recording(
         raise NoUsableTopic("The table has the pose of no arm: all its poses are 0.")
     for motion in motions:
         check_outside(motion)
-    setpoints = setpoints_in(values, motions, {}, stamps_ns)
-    here = {motion.topic for motion in (*motions, *setpoints.tips)} | {one.topic for one in joints}
-    here |= {signal.topic for _, signal in (*jaws, *setpoints.jaws)}
+    tips, jaw_setpoints, unusable = setpoints_in(values, motions, {}, stamps_ns)
+    here = {motion.topic for motion in (*motions, *tips)} | {one.topic for one in joints}
+    here |= {signal.topic for _, signal in (*jaws, *jaw_setpoints)}
     arms = sorted({motion.arm for motion in motions})
-    return Recording(
+    return recording.Recording(
         format="csv",
         integrity="none",
         motions=tuple(motions),
         jaws=tuple(jaws),
-        topics=tuple(Topic(name, _KIND, len(stamps_ns)) for name in sorted(here)),
+        topics=tuple(recording.Topic(name, _KIND, len(stamps_ns)) for name in sorted(here)),
         joints=tuple(joints),
         tools=() if options.instrument is None else tuple((arm, options.instrument) for arm in arms),
-        left_out=(*left_out, *setpoints.left_out),
+        left_out=(*left_out, *unusable),
         columns=columns,
-        setpoints=tuple(setpoints.tips),
-        jaw_setpoints=tuple(setpoints.jaws),
+        setpoints=tuple(tips),
+        jaw_setpoints=tuple(jaw_setpoints),
     )
 
 
@@ -298,7 +290,7 @@ def _frame(arm: str, arms: Sequence[str], options: ReadingOptions) -> str:
     return options.frame
 
 
-def _local(arm: str, stamps_ns: Ints, pose: Parts, seen: Motion | None) -> Motion:
+def _local(arm: str, stamps_ns: Ints, pose: Parts, seen: recording.Motion | None) -> recording.Motion:
     """Return the motion in the arm's base.
 
     Args:
@@ -311,11 +303,11 @@ def _local(arm: str, stamps_ns: Ints, pose: Parts, seen: Motion | None) -> Motio
         MixedFrames: `rcm_pose` is not known to be the tip in the arm's base.
     """
     local = pose_motion(arm, "local_pose", f"{arm}_base", stamps_ns, pose)
-    if np.ptp(local.tip_mm, axis=0).max() < WIDE_MM:
+    if np.ptp(local.tip_mm, axis=0).max() < recording.WIDE_MM:
         raise MixedFrames("It stands still: it may be the pose of the arm's base, and not of its tip.")
     if seen is None:
         raise MixedFrames("The arm has no other pose that would show whether it is the tip in the arm's base.")
-    bases = base_frames(Recording("csv", "none", (local, replace(seen, frame="other"))))
+    bases = recording.base_frames(recording.Recording("csv", "none", (local, replace(seen, frame="other"))))
     if not bases or bases[0].spread_mm > STEADY_MM or bases[0].spread_rad > STEADY_RAD:
         raise MixedFrames("No fixed transform leads from it to the arm's other pose, so its frame is not known.")
     return local

@@ -2,8 +2,16 @@
 
 A kinematics file has one row per video frame, 30 per second, with 76 numbers and no header:
 
-    columns 1-19 master left, 20-38 master right, 39-57 instrument left, 58-76 instrument right; for each
+    columns 1-19 master left, 20-38 master right, 39-57 instrument right, 58-76 instrument left; for each
     x y z (m), rotation matrix by rows (9), linear velocity (3), angular velocity (3), gripper (rad)
+
+The data set's own description has the instruments the other way round. But in all 79 trials of Knot_Tying and
+Needle_Passing the left master moves as columns 58-76 do (correlation of speeds at least 0.99; with columns 39-57 at
+most 0.73), and those who labelled the videos call columns 58-76 the left instrument (COMPASS, Hutchinson et al. 2023).
+A trial in which the masters move as the other way round is refused.
+
+A public copy has the same numbers as comma-separated text below a line of names, which calls columns 39-57
+`SLAVE_LEFT`.
 
 A transcription has one gesture per line, `start end G6`, in frames counted from 1, both inclusive. A meta file has one
 trial per line: its name, the surgeon's self-reported skill (N, I or E), the global rating score and its six parts.
@@ -39,7 +47,17 @@ ORTHONORMAL = 5e-3  # ours: we measured deviations of 1e-3 in the masters' matri
 Skill = Literal["novice", "intermediate", "expert"]
 SKILLS: dict[str, Skill] = {"N": "novice", "I": "intermediate", "E": "expert"}
 
-_ARMS = {"MTML": 0, "MTMR": 19, "PSM_left": 38, "PSM_right": 57}  # index of the first of the arm's 19 columns
+_ARMS = {"MTML": 0, "MTMR": 19, "PSM_left": 57, "PSM_right": 38}  # index of the first of the arm's 19 columns
+SIDES = 0.1  # ours: correlations of speeds differ by at least 0.27 in 79 trials
+_PARTS = (
+    *(f"POS_{axis}" for axis in "XYZ"),
+    *(f"ROT_R{row}{column}" for row in "123" for column in "123"),
+    *(f"{kind}_VEL_{axis}" for kind in ("LIN", "ROT") for axis in "XYZ"),
+    "GRIPPER_ANGLE",
+)
+HEADER = ",".join(
+    f"{side}_{part}" for side in ("MASTER_LEFT", "MASTER_RIGHT", "SLAVE_LEFT", "SLAVE_RIGHT") for part in _PARTS
+)
 _GESTURE = re.compile(r"\s*(\d{1,7})\s+(\d{1,7})\s+(G\d{1,2})\s*")
 _TRIAL = re.compile(r"(?P<task>[A-Za-z_]+)_(?P<user>[A-Z])(?P<number>\d{3})")
 
@@ -71,6 +89,7 @@ class Trial:
         user: The letter of the surgeon.
         number: The number of the repetition.
         kinematics: The file with its motion.
+        meta: The file with the ratings of its task, which may be missing.
         transcription: The file with its gestures, None where there is none.
         rated: Its ratings in the task's meta file, None where there are none.
     """
@@ -80,13 +99,14 @@ class Trial:
     user: str
     number: int
     kinematics: Path
+    meta: Path
     transcription: Path | None
     rated: RatedTrial | None
 
 
 def looks_like_kinematics(first_line: str) -> bool:
     """Return whether a text with this first line may be kinematics."""
-    return "," not in first_line and len(first_line.split()) == COLUMNS
+    return first_line.strip() == HEADER or ("," not in first_line and len(first_line.split()) == COLUMNS)
 
 
 def read_jigsaws(file: BinaryIO, transcription: str = "", rated: RatedTrial | None = None) -> Recording:
@@ -101,7 +121,7 @@ def read_jigsaws(file: BinaryIO, transcription: str = "", rated: RatedTrial | No
         The recording, in millimetres, in the frame "jigsaws".
 
     Raises:
-        UnreadableRecording: A row without 76 numbers, or a gesture outside the trial.
+        UnreadableRecording: A row without 76 numbers, a gesture outside the trial, or instruments that are exchanged.
         NotFinite: NaN or infinity.
         NotAQuaternion: A matrix that is not a rotation.
         NotMetres: As in `skills.demonstration.recording`.
@@ -109,6 +129,7 @@ def read_jigsaws(file: BinaryIO, transcription: str = "", rated: RatedTrial | No
     table = _table(file)
     stamps_ns = np.rint(np.arange(len(table)) * (1e9 / RATE_HZ)).astype(np.int64)
     motions = {arm: _motion(arm, table, stamps_ns, first) for arm, first in _ARMS.items()}
+    _check_sides(table)
     grippers = {arm: Signal(stamps_ns, table[:, first + 18], _columns(first)) for arm, first in _ARMS.items()}
     return Recording(
         format="jigsaws",
@@ -146,13 +167,21 @@ def is_transcription(text: str) -> bool:
 
 
 def trials(folder: Path) -> Iterator[Trial]:
-    """Yield the trials in a folder of the data set, or of one of its tasks, sorted by path."""
-    for kinematics in sorted(folder.rglob("kinematics/AllGestures/*.txt")):
+    """Yield the trials in a folder of the data set, or of one of its tasks, sorted by path.
+
+    A trial of the comma-separated copy is omitted where the folder has it in the data set's own form too.
+    """
+    found = sorted(folder.rglob("kinematics/AllGestures/*.txt"))
+    names = {path.stem for path in found}
+    found += sorted(path for path in folder.rglob("processed/*/*.csv") if path.stem not in names)
+    for kinematics in found:
         named = _TRIAL.fullmatch(kinematics.stem)
         if named is None:
             continue
         home, task = kinematics.parents[2], named["task"]
-        transcription, meta = home / "transcriptions" / kinematics.name, home / f"meta_file_{task}.txt"
+        places = (home / f"meta_file_{task}.txt", home / "trial_results" / f"meta_file_{task}.txt")
+        meta = next((place for place in places if place.is_file()), places[0])
+        transcription = home / "transcriptions" / f"{kinematics.stem}.txt"
         rated = read_meta(meta.read_text(errors="replace")) if meta.is_file() else {}
         yield Trial(
             name=kinematics.stem,
@@ -160,6 +189,7 @@ def trials(folder: Path) -> Iterator[Trial]:
             user=named["user"],
             number=int(named["number"]),
             kinematics=kinematics,
+            meta=meta,
             transcription=transcription if transcription.is_file() else None,
             rated=rated.get(kinematics.stem),
         )
@@ -167,13 +197,18 @@ def trials(folder: Path) -> Iterator[Trial]:
 
 def _table(file: BinaryIO) -> Floats:
     """Return the numbers, shape (T, 76)."""
-    if not file.read(1):
-        raise UnreadableRecording("The kinematics file is empty.")
+    first = file.readline().decode("utf-8", "replace")
     file.seek(0)
+    if not first:
+        raise UnreadableRecording("The kinematics file is empty.")
+    comma, heads = (",", 1) if first.strip() == HEADER else (None, 0)
     try:
-        table = np.loadtxt(file, dtype=np.float64, comments=None, ndmin=2, max_rows=ROWS + 1, encoding="utf-8")
+        table = np.loadtxt(
+            file, comments=None, delimiter=comma, skiprows=heads, ndmin=2, max_rows=ROWS + 1, encoding="utf-8"
+        )
     except (ValueError, UnicodeDecodeError) as error:
-        raise UnreadableRecording(f"{_wrong_row(file)} JIGSAWS kinematics have {COLUMNS} numbers per row.") from error
+        where = _wrong_row(file, comma, heads)
+        raise UnreadableRecording(f"{where} JIGSAWS kinematics have {COLUMNS} numbers per row.") from error
     if table.shape[1:] != (COLUMNS,) or len(table) > ROWS:
         raise UnreadableRecording(
             f"The table has {table.shape[1]} columns and {len(table)} rows; JIGSAWS kinematics have {COLUMNS} columns "
@@ -186,11 +221,29 @@ def _table(file: BinaryIO) -> Floats:
     return table
 
 
-def _wrong_row(file: BinaryIO) -> str:
+def _check_sides(table: Floats) -> None:
+    """Refuse a trial whose masters move as the instruments of the other side do.
+
+    Raises:
+        UnreadableRecording: The speeds of a master and the instrument of the other side agree better than with its own.
+    """
+    speeds = {arm: np.linalg.norm(np.diff(table[:, first : first + 3], axis=0), axis=1) for arm, first in _ARMS.items()}
+    for master, own, other in (("MTML", "PSM_left", "PSM_right"), ("MTMR", "PSM_right", "PSM_left")):
+        if all(np.ptp(speeds[arm]) > 0 for arm in (master, own, other)):  # no correlation with one that stands still
+            with_own, with_other = (float(np.corrcoef(speeds[master], speeds[arm])[0, 1]) for arm in (own, other))
+            if not with_other <= with_own + SIDES:
+                raise UnreadableRecording(
+                    f"{master} moves as {_columns(_ARMS[other])} do (correlation of speeds {with_other:.2f}), not as "
+                    f"{_columns(_ARMS[own])} ({with_own:.2f}), which it drives in JIGSAWS: check the order of columns.",
+                    correlation=with_other,
+                )
+
+
+def _wrong_row(file: BinaryIO, comma: str | None, heads: int) -> str:
     """Return a description of the first invalid row, with its position."""
     file.seek(0)
     for number, line in enumerate(file, start=1):
-        cells = line.split()
+        cells = line.strip().split(comma.encode() if comma else None) if number > heads else []
         if cells and len(cells) != COLUMNS:
             return f"Row {number} has {len(cells)} cells."
         for column, cell in enumerate(cells, start=1):

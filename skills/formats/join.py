@@ -1,15 +1,16 @@
 """Joining the parts of a split bag into one recording, topic by topic, in order of time."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import TypeVar
 
 import numpy as np
 
-from skills.demonstration.recording import Joints, Label, Motion, Recording, Signal, Topic, recorded_motion
+from skills.demonstration.recording import Joints, Label, Motion, Recording, Signal, recorded_motion
 from skills.errors import MixedFrames, SkillsError
+from skills.formats.topics import counted
 
 Named = tuple[str, Signal]
 Part = TypeVar("Part", Motion, Joints, Named)
@@ -29,22 +30,21 @@ def join(parts: Sequence[Recording]) -> Recording:
         return parts[0]
     faults = {topic: why for part in parts for topic, why in part.left_out}  # also if only one part has it
     pedals, clutches = _signals(part.pedals for part in parts), [part.clutch for part in parts if part.clutch]
-    tips = list(
-        _sound(_grouped((part.setpoints for part in parts), lambda motion: motion.topic), _joined_motion, faults)
-    )
-    jaws = list(
-        _sound(_grouped((part.jaw_setpoints for part in parts), lambda pair: pair[1].topic), _joined_signal, faults)
-    )
+    tips = _sound(_grouped((part.setpoints for part in parts), lambda one: one.topic), _joined_motion, faults)
+    jaws = _sound(_grouped((part.jaw_setpoints for part in parts), lambda one: one[1].topic), _joined_signal, faults)
     first, integrities = parts[0], {part.integrity for part in parts}
+    counts: Counter[tuple[str, str]] = Counter()
+    for topic in chain.from_iterable(part.topics for part in parts):
+        counts[topic.name, topic.type] += topic.messages
     return Recording(
         format=first.format,
         integrity=first.integrity if len(integrities) == 1 else "partial",
         motions=_motions(part.motions for part in parts),
         jaws=_signals(part.jaws for part in parts),
         clutch=_clutch(pedals, clutches),
-        topics=_topics(part.topics for part in parts),
+        topics=counted(counts),
         joints=tuple(
-            _joined_joints(one) for _, one in _grouped((part.joints for part in parts), lambda joints: joints.topic)
+            _joined_joints(some) for _, some in _grouped((part.joints for part in parts), lambda one: one.topic)
         ),
         masters=_motions(part.masters for part in parts),
         grippers=_signals(part.grippers for part in parts),
@@ -55,8 +55,8 @@ def join(parts: Sequence[Recording]) -> Recording:
         labels=in_time(label for part in parts for label in part.labels),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
         left_out=tuple(faults.items()),
-        setpoints=tuple(tips),
-        jaw_setpoints=tuple(jaws),
+        setpoints=tips,
+        jaw_setpoints=jaws,
     )
 
 
@@ -75,14 +75,16 @@ def _grouped(parts: Iterable[Iterable[Part]], key: Callable[[Part], str]) -> lis
 
 def _sound(
     grouped: Iterable[tuple[str, list[Part]]], joined: Callable[[list[Part]], Part], faults: dict[str, str]
-) -> Iterator[Part]:
-    """Yield the joined setpoints of each topic without a fault; the faults of others are added."""
+) -> tuple[Part, ...]:
+    """Return the joined setpoints of each topic without a fault; the faults of others are added."""
+    sound = []
     for topic, pieces in grouped:
         try:
             if topic not in faults:
-                yield joined(pieces)
+                sound.append(joined(pieces))
         except SkillsError as error:
             faults[topic] = str(error)
+    return tuple(sound)
 
 
 def _motions(parts: Iterable[Iterable[Motion]]) -> tuple[Motion, ...]:
@@ -136,11 +138,3 @@ def _clutch(pedals: tuple[Named, ...], clutches: list[Signal]) -> Signal | None:
         return None
     topic = clutches[0].topic
     return dict(pedals).get(topic) or _joined_signal([(topic, one) for one in clutches if one.topic == topic])[1]
-
-
-def _topics(parts: Iterable[Iterable[Topic]]) -> tuple[Topic, ...]:
-    counts: Counter[tuple[str, str]] = Counter()
-    for topics in parts:
-        for topic in topics:
-            counts[topic.name, topic.type] += topic.messages
-    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))

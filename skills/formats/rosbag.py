@@ -18,7 +18,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, BinaryIO, Literal
@@ -164,12 +164,11 @@ def read_rosbag(files: Sequence[BinaryIO], suffix: Suffix, integrity: Integrity 
         NoUsableTopic: No topic has the pose of a PSM.
         MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
     """
-    with ExitStack() as open_files:
-        with tempfile.TemporaryDirectory() as folder:
-            paths = [_copied(file, Path(folder) / f"part{number}{suffix}") for number, file in enumerate(files)]
-            reader = open_files.enter_context(_reading(paths))  # open files stay readable without their folder
-        out = open_files.enter_context(tempfile.TemporaryFile())  # unnamed: deleted when closed
-        with _refusing(paths[0]):
+    with tempfile.TemporaryFile() as out:  # unnamed: deleted when closed
+        with ExitStack() as opened:
+            with tempfile.TemporaryDirectory() as folder:
+                paths = [_copied(file, Path(folder) / f"part{number}{suffix}") for number, file in enumerate(files)]
+                reader = opened.enter_context(_reading(paths))  # open files stay readable without their folder
             here = _convert(reader, out)
         out.seek(0)
         return replace(read_mcap(out), format=_FORMATS[suffix], integrity=integrity, topics=here)
@@ -190,7 +189,7 @@ def convert(paths: Sequence[Path], out: IO[bytes], notes: dict[str, str] | None 
         UnreadableRecording: rosbags cannot read it.
         NoUsableTopic: No topic has the pose of a PSM.
     """
-    with _reading(paths) as reader, _refusing(paths[0]):
+    with _reading(paths) as reader:
         return _convert(reader, out, notes)
 
 
@@ -219,7 +218,7 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
         NoUsableTopic: There is no such topic of such messages, or it has no position.
         BackwardStamps: The stamps do not increase.
     """
-    with _reading([path]) as reader, _refusing(path):
+    with _reading([path]) as reader:
         kinds = [(one.topic, one.msgtype) for one in reader.connections]
         wanted = [one for one in reader.connections if one.topic == topic and one.msgtype in _PLACES]
         if not wanted:
@@ -234,7 +233,7 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
         for connection, _, data in reader.messages(connections=wanted):
             said: Any = reader.deserialize(data, connection.msgtype)
             place = _PLACES[connection.msgtype](said)
-            stamps.append(_stamp_ns(said.header))
+            stamps.append(int(said.header.stamp.sec) * _NANO + int(said.header.stamp.nanosec))
             places.append((place.x, place.y, place.z))
     place_mm = 1000.0 * np.array(places, np.float64).reshape(-1, 3)
     seen = np.isfinite(place_mm).all(axis=1)  # a tracker that has lost its marker says NaN
@@ -248,15 +247,10 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
 
 @contextmanager
 def _reading(paths: Sequence[Path]) -> Iterator[AnyReader]:
-    with ExitStack() as stack:
-        with _refusing(paths[0]):
-            reader = stack.enter_context(AnyReader(paths, default_typestore=_ROS2))
-        yield reader
-
-
-def _refusing(path: Path) -> AbstractContextManager[None]:
     advice = "Copy it again, or convert it with `ros2 bag convert` or `rosbags-convert`."
-    return refusing(f"The {_NAMES.get(path.suffix, 'bag')}", advice)
+    what = f"The {_NAMES.get(paths[0].suffix, 'bag')}"
+    with refusing(what, advice), AnyReader(paths, default_typestore=_ROS2) as reader:
+        yield reader
 
 
 def _convert(reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
@@ -275,7 +269,7 @@ def _topics(reader: AnyReader) -> tuple[Topic, ...]:
     counts: Counter[tuple[str, str]] = Counter()
     for connection in reader.connections:
         counts[connection.topic, connection.msgtype] += connection.msgcount
-    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+    return topics.counted(counts)
 
 
 def _messages(reader: AnyReader, used: Sequence[Any]) -> Iterator[Message]:
@@ -298,10 +292,6 @@ _PLACES: dict[str, Callable[[Any], Any]] = {
     topics.TRANSFORM: lambda said: said.transform.translation,
     topics.POINT: lambda said: said.point,
 }
-
-
-def _stamp_ns(header: Any) -> int:
-    return int(header.stamp.sec) * _NANO + int(header.stamp.nanosec)
 
 
 def _copied(file: BinaryIO, path: Path) -> Path:

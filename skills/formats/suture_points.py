@@ -16,7 +16,7 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 
-from skills.arrays import Floats, xyz
+from skills.arrays import Floats, xyz, xyzw
 from skills.demonstration.recording import Motion, Recording
 from skills.errors import MixedFrames, NotMetres, NoUsableTopic, UnreadableRecording
 from skills.formats.mcap import read_mcap
@@ -74,7 +74,8 @@ def suture_points(scene: Recording, *, arm: str | None = None, frame: str | None
             )
         kind: Kind = "entry" if mark.arm.lower().startswith("entry") else "exit"
         turn = rotation @ first.setdefault(kind, rotation).T
-        points.append(SuturePoint(mark.arm, kind, kind == "exit", xyz(tip), _xyzw(rotation), _xyzw(turn)))
+        turns = map(xyzw, quaternion_of(np.stack([rotation, turn])))
+        points.append(SuturePoint(mark.arm, kind, kind == "exit", xyz(tip), *turns))
     own_arm = arm if base is None or arm is not None else base.arm
     return SuturePoints(arm=own_arm, frame=frame or f"{own_arm}_base", points=tuple(points))
 
@@ -177,8 +178,3 @@ def _sort_key(name: str) -> tuple[int, str]:
     found = _MARK.fullmatch(name)
     assert found is not None
     return int(found[2]), found[1].lower()
-
-
-def _xyzw(rotation: Floats) -> tuple[float, float, float, float]:
-    x, y, z, w = quaternion_of(rotation[None])[0].tolist()
-    return x, y, z, w

@@ -42,21 +42,8 @@ from skills.demonstration.recording import (
     recorded_motion,
     recorded_signal,
 )
-from skills.errors import (
-    BadColumns,
-    BadSettings,
-    NoUsableTopic,
-)
-from skills.formats.cells import (
-    NS_PER,
-    Decimals,
-    check_last_number,
-    ends_with_line,
-    header_of,
-    is_number,
-    open_text,
-    read_numbers,
-)
+from skills.errors import BadColumns, BadSettings, NoUsableTopic
+from skills.formats import cells
 from skills.formats.columns import (
     BASE,
     base_of,
@@ -77,13 +64,13 @@ _FASTEST_HZ = 100_000.0
 
 LENGTHS: Mapping[str, float] = {"m": 1000.0, "mm": 1.0}  # in mm
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": np.pi / 180}  # in rad
-_DIMENSIONS: tuple[Mapping[str, float], ...] = (NS_PER, LENGTHS, ANGLES)
+_DIMENSIONS: tuple[Mapping[str, float], ...] = (cells.NS_PER, LENGTHS, ANGLES)
 PLAIN: Mapping[str, float] = {"": 1.0}
 POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 RPY, ROTATION_VECTOR = ("roll", "pitch", "yaw"), ("rx", "ry", "rz")
 JOINT_NAMES = tuple(f"q{k}" for k in range(1, len(JOINTS) + 1))
 QUANTITIES: Mapping[str, Mapping[str, float]] = {
-    "t": NS_PER,
+    "t": cells.NS_PER,
     **dict.fromkeys(POSITION, LENGTHS),
     **dict.fromkeys(QUATERNION, PLAIN),
     **dict.fromkeys((*RPY, *ROTATION_VECTOR, "jaw"), ANGLES),
@@ -128,7 +115,7 @@ class ReadingOptions:
     frame: str | None = None
     column: Sequence[str] = ()
     unit: Sequence[str] = ()
-    decimal: Decimals = "point"
+    decimal: cells.Decimals = "point"
     table_arm: str | None = None
     instrument: str | None = None
     untimed: bool = False
@@ -182,23 +169,18 @@ def read_table(file: BinaryIO, reading: ReadingOptions | None = None) -> Recordi
         NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: As in `skills.demonstration.recording`.
     """
     options = reading or ReadingOptions()
-    is_ended = ends_with_line(file)
-    with open_text(file) as text:
-        names, separator = header_of(text)
+    is_ended = cells.ends_with_line(file)
+    with cells.open_text(file) as text:
+        names, separator = cells.header_of(text)
         uses = _uses(names, options)
         _check_groups(uses)
         time = uses.get("t")
         check_time(None if time is None else names[time.index], options)
-        numbers = read_numbers(
-            text,
-            names,
-            [[use.index] for use in uses.values()],
-            separator,
-            options.decimal,
-            None if time is None else (time.index, time.unit),
-        )
+        at = None if time is None else (time.index, time.unit)
+        used = [[use.index] for use in uses.values()]
+        numbers = cells.read_numbers(text, cells.TableLayout(names, used, separator, options.decimal, at))
     if not is_ended:
-        check_last_number(file, separator, options.decimal)
+        cells.check_last_number(file, separator, options.decimal)
     stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, options)
     if time is not None and time.unit != "s":
         check_steps(names[time.index], time.unit, stamps_ns)
@@ -254,7 +236,7 @@ def _uses(names: list[str], options: ReadingOptions) -> dict[str, _Use]:
         BadColumns: A column is unknown or duplicate, or a mapping names one that does not exist.
         BadSettings: A mapping or a unit is impossible, or contradicts another.
     """
-    if all(map(is_number, names)):
+    if all(map(cells.is_number, names)):
         raise BadColumns(
             "The table has no header: its first row has numbers. Write the names of the columns above it, separated as "
             f"the numbers are. Known columns: {KNOWN}."

@@ -11,8 +11,11 @@ like) are not used, nor are poses of other things (`T_b_w`, the base of an arm i
 """
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from enum import Enum, auto
+
+from skills.demonstration.recording import Topic
 
 POSE = "geometry_msgs/msg/PoseStamped"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
@@ -94,6 +97,11 @@ def is_setpoint(topic: str, message_type: str) -> bool:
     """Return whether a topic carries setpoints of a PSM's tip or jaw; no recording is refused for them."""
     said = meaning(topic, message_type)
     return said is not None and said.kind in (TopicKind.SETPOINT, TopicKind.JAW_SETPOINT)
+
+
+def counted(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
+    """Return topics, sorted, from the number of messages by name and type."""
+    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
 
 def _of_pose(topic: str) -> Meaning | None:

@@ -27,16 +27,8 @@ from mcap.writer import Writer
 
 from skills.demonstration.recording import Label, Topic
 from skills.errors import BadInput, SkillsError, UnreadableRecording
-from skills.formats import rosbag
+from skills.formats import bag_folder, rosbag
 from skills.formats.archive import pack
-from skills.formats.bag_folder import (
-    METADATA,
-    check_counts,
-    in_order,
-    read_metadata,
-    suffix_of,
-    unzstd,
-)
 from skills.formats.checksums import digest_of
 from skills.formats.jigsaws import trials
 from skills.formats.lerobot import INFO
@@ -44,6 +36,7 @@ from skills.formats.mcap import MAGIC
 from skills.formats.mcap.reader import NOTES
 from skills.formats.mcap.records import RECOVER
 from skills.formats.tags import TAGS_BYTES, read_labels
+from skills.formats.topics import counted
 from skills.remedies import Action, Remedy, did_you_mean
 
 PICTURES = frozenset(
@@ -76,7 +69,7 @@ class Bag:
     """A bag on this machine: its files in order, its metadata.yaml and its stages."""
 
     files: tuple[Path, ...]
-    metadata: Path | None = None
+    metadata: bag_folder.Metadata | None = None
     labels: tuple[Label, ...] = ()
 
     @property
@@ -101,7 +94,7 @@ def find_bag(path: Path) -> Bag:
             *did_you_mean(path.name, beside),
             "Check its spelling and the current folder.",
         )
-    files = [file for file in sorted(path.rglob("*")) if file.is_file() and suffix_of(file.name)]
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and bag_folder.suffix_of(file.name)]
     homes = sorted({file.parent for file in files})
     if not homes and (path / INFO).is_file():
         raise BadInput(f"{path} is a LeRobot dataset.", Remedy(Action.CUT_EPISODE))
@@ -112,15 +105,15 @@ def find_bag(path: Path) -> Bag:
     if len(homes) != 1:
         listed = "".join(f"\n  {home}" for home in homes[:20])
         raise BadInput(f"{path} has {len(homes)} folders with bags; name one of them:{listed}.")
-    if len({suffix_of(file.name) for file in files}) > 1:
+    if len({bag_folder.suffix_of(file.name) for file in files}) > 1:
         raise BadInput(f"{homes[0]} has bags of several formats; name one of the files.")
-    metadata = homes[0] / METADATA
-    known = read_metadata(metadata.read_text(errors="replace")) if metadata.is_file() else None
+    metadata = homes[0] / bag_folder.METADATA
+    known = bag_folder.read_metadata(metadata.read_text(errors="replace")) if metadata.is_file() else None
     names = {file.name: file for file in files}
-    ordered = in_order(sorted(names, key=_by_number), known) if known else sorted(names, key=_by_number)
+    ordered = bag_folder.in_order(sorted(names, key=_by_number), known) if known else sorted(names, key=_by_number)
     return Bag(
         files=tuple(names[name] for name in ordered),
-        metadata=metadata if known else None,
+        metadata=known,
         labels=_labels_in(path),
     )
 
@@ -147,7 +140,7 @@ def prepare_upload(bag: Bag, progress: Progress = ignore) -> Iterator[Path]:
         stages = Path(folder) / "session_tags.json"
         stages.write_bytes(_stages(bag.labels))
         with path.open("rb") as file, stages.open("rb") as said, packed.open("wb") as out:
-            pack({f"{_NAME}/{_NAME}{suffix_of(path.name)}": file, "session_tags.json": said}, out)
+            pack({f"{_NAME}/{_NAME}{bag_folder.suffix_of(path.name)}": file, "session_tags.json": said}, out)
         yield packed
 
 
@@ -186,7 +179,7 @@ def _can_be_rewritten(file: Path) -> bool:
 
 def _check(bag: Bag, topics: Sequence[Topic]) -> None:
     if bag.metadata is not None:
-        check_counts(read_metadata(bag.metadata.read_text(errors="replace")), topics)
+        bag_folder.check_counts(bag.metadata, topics)
 
 
 def _plain_file(file: Path, folder: Path) -> Path:
@@ -195,7 +188,7 @@ def _plain_file(file: Path, folder: Path) -> Path:
         return file
     plain = folder / file.stem
     with file.open("rb") as packed, plain.open("wb") as out:
-        unzstd(packed, out)
+        bag_folder.unzstd(packed, out)
     return plain
 
 
@@ -264,7 +257,7 @@ def topics_of(path: Path) -> tuple[Topic, ...]:
                     for one in summary.channels.values()
                 )
             file.seek(0)
-            return _topics(Counter((channel.topic, _type(schema)) for schema, channel, _ in _messages(file, ignore)))
+            return counted(Counter((channel.topic, _type(schema)) for schema, channel, _ in _messages(file, ignore)))
     except Exception as error:
         raise _unreadable(path, error) from error
 
@@ -310,7 +303,7 @@ def copy_without_pictures(
         except Exception as error:
             raise _unreadable(path, error) from error
     writer.finish()  # type: ignore[no-untyped-call]
-    return _topics(counts)
+    return counted(counts)
 
 
 def _place(writer: Writer, numbers: dict[tuple[object, ...], int], schema: Schema | None, channel: Channel) -> int:
@@ -341,10 +334,6 @@ def _messages(file: IO[bytes], progress: Progress) -> Iterator[tuple[Schema | No
     declared = None if summary is None or summary.statistics is None else summary.statistics.message_count
     if declared not in (None, found):
         raise UnreadableRecording(f"it declares {declared} messages, but has {found}")
-
-
-def _topics(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
-    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
 
 def _type(schema: Schema | None) -> str:

@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, BinaryIO, TypeVar
 
 import numpy as np
@@ -24,6 +23,7 @@ from pydantic import AliasPath, BaseModel, Field, StrictBool, StrictStr, Validat
 
 from skills.arrays import Flags, Floats, Ints
 from skills.errors import BadBag, Corrupt, UnknownInstrument
+from skills.formats import replay_bag
 from skills.formats.archive import Archive, shown
 from skills.formats.bag_folder import METADATA
 from skills.formats.bag_writer import DEFINITIONS, Written, metadata_of
@@ -31,17 +31,6 @@ from skills.formats.checksums import SUMS, digest_of, read_sums
 from skills.formats.columns import in_mm
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Wanted, fields_of
 from skills.formats.mcap.reader import Channel, MessageSchema, Walker
-from skills.formats.replay_bag import (
-    CRTK_ARMS,
-    ArmMotion,
-    ExecutorTimetable,
-    JawMove,
-    Role,
-    arm_names,
-    messages_of,
-    notes_of,
-    velocities_of,
-)
 from skills.formats.topics import JOINT_STATE, POSE
 from skills.kinematics import JOINTS, angle_between, forward, instrument_of, joint_margins, matrix_of
 from skills.packing import canonical, sha256
@@ -112,7 +101,7 @@ class JointPaper(BaseModel):
 class ArmPaper(BaseModel):
     """The judged figures of an arm."""
 
-    name: Role
+    name: replay_bag.Role
     joints: Annotated[list[JointPaper], Field(min_length=len(JOINTS), max_length=len(JOINTS))]
 
 
@@ -148,11 +137,11 @@ class Papers:
     policy: PolicyPaper
 
 
-def verify_bag(path: Path, key: PublicKey | None = None) -> list[str]:
+def verify_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
     """Verify a replay bag, and return the checks that passed as text.
 
     Args:
-        path: The file.
+        file: The bag.
         key: The public key of the service that must have signed it. Without it a signature is not verified.
 
     Raises:
@@ -160,12 +149,6 @@ def verify_bag(path: Path, key: PublicKey | None = None) -> list[str]:
         BadSignature: Another key signed it, or it was changed since.
         UnreadableRecording: The archive or a file in it is damaged or dangerous.
     """
-    with path.open("rb") as file:
-        return check_bag(file, key)
-
-
-def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
-    """Verify a replay bag in an open file; see `verify_bag`."""
     archive = Archive(file)
     arms = _arms_in(archive.names)
     sums = _check_sums(archive)
@@ -173,16 +156,17 @@ def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
     papers = _read_papers(archive)
     plan, verdict = papers.plan, papers.verdict
     _check_statement(statement, papers)
-    motions = [_read_arm(archive, name, plan) for name in arms]
+    read = [_read_arm(archive, name, plan) for name in arms]
+    motions = [motion for motion, _ in read]
     _check_roles(motions, plan)
-    _check_timetable(_paper(archive, EXECUTOR, ExecutorTimetable), plan, motions)
+    _check_timetable(_paper(archive, EXECUTOR, replay_bag.ExecutorTimetable), plan, motions)
     for motion in motions:
         _check_judged(motion, papers.report)
     return [
         f"{len(archive.names)} files, and {SUMS} has the right checksum of each other file.",
         f"Plan {plan.sha256[:12]}, the feasible verdict {verdict.sha256[:12]} and policy {papers.policy.sha256[:12]} "
         "belong together.",
-        *(_describe(motion) for motion in motions),
+        *(_describe(motion, off_mm) for motion, off_mm in read),
         *([] if plan.psm_m else ["It has no hand-off: no PSM_M, no A2."]),
         signed,
     ]
@@ -193,7 +177,7 @@ def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
 
 def _arms_in(names: list[str]) -> list[str]:
     """Return the arms, PSM_A and optionally PSM_M, and refuse any file besides their folders and the papers."""
-    arms = [name for name in CRTK_ARMS if f"{name}/{name}.mcap" in names]
+    arms = [name for name in replay_bag.CRTK_ARMS if f"{name}/{name}.mcap" in names]
     expected = {SUMS, *PAPERS} | {f"{name}/{file}" for name in arms for file in (METADATA, f"{name}.mcap")}
     missing, extra = sorted(expected - set(names)), sorted(set(names) - expected - {SIGNATURE})
     if not 1 <= len(arms) <= 2:
@@ -289,7 +273,9 @@ def _read_papers(archive: Archive) -> Papers:
     return Papers(plan, verdict, report, policy)
 
 
-def _check_timetable(timetable: ExecutorTimetable, plan: PlanPaper, motions: list[ArmMotion]) -> None:
+def _check_timetable(
+    timetable: replay_bag.ExecutorTimetable, plan: PlanPaper, motions: list[replay_bag.ArmMotion]
+) -> None:
     """Check that the timetable is this plan's, and that both arms have a setpoint at every one of its stamps.
 
     And that jaws are as stated when they have moved, each after the one before.
@@ -303,7 +289,7 @@ def _check_timetable(timetable: ExecutorTimetable, plan: PlanPaper, motions: lis
         raise BadBag(f"{EXECUTOR} is not the timetable of this bag. Export the bag again.")
 
 
-def _in_order(jaws: list[JawMove], motions: list[ArmMotion]) -> bool:
+def _in_order(jaws: list[replay_bag.JawMove], motions: list[replay_bag.ArmMotion]) -> bool:
     """Return whether the jaws move one after the other to the stated angles."""
     arms = {motion.name: motion for motion in motions}
     for jaw in jaws:
@@ -339,8 +325,8 @@ class _Topic:
         return np.concatenate([columns.values for columns in self.columns])
 
 
-def _read_arm(archive: Archive, name: str, plan: PlanPaper) -> ArmMotion:
-    """Read one arm's folder, and run all checks that concern this arm alone."""
+def _read_arm(archive: Archive, name: str, plan: PlanPaper) -> tuple[replay_bag.ArmMotion, float]:
+    """Read one arm's folder, and run all checks that concern this arm alone; see `_check_form` for the number."""
     file_name = f"{name}.mcap"
     with archive.unpacked(f"{name}/{file_name}") as file:
         walker, topics = _walk(file, name)
@@ -351,9 +337,9 @@ def _read_arm(archive: Archive, name: str, plan: PlanPaper) -> ArmMotion:
     if archive.text(f"{name}/{METADATA}").encode() != metadata_of(written, file_name):
         raise BadBag(f"{name}/{METADATA} does not describe {file_name}. Export the bag again.")
     _check_joints(motion, topics)
-    _check_form(motion)
+    off_mm = _check_form(motion)
     _check_written(motion, walker.notes, topics, plan)
-    return motion
+    return motion, off_mm
 
 
 def _walk(file: BinaryIO, name: str) -> tuple[Walker, dict[str, _Topic]]:
@@ -393,7 +379,7 @@ def _decoder(channel: Channel, schema: MessageSchema, said: _Topic) -> Decoder:
     return Decoder(channel.topic, fields_of(schema.name, schema.definition.decode()), said.wanted)
 
 
-def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: PlanPaper) -> ArmMotion:
+def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: PlanPaper) -> replay_bag.ArmMotion:
     """Convert the messages that were read back into an `ArmMotion`."""
     on_joints, on_tip, on_jaw = topics.values()
     counts = [len(said.messages) for said in (on_joints, on_tip, on_jaw)]
@@ -412,14 +398,14 @@ def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: P
         raise BadBag(f"{name} has NaN or infinity in a setpoint; it must not be played.")
     try:
         instrument_of(instrument := notes["instrument"])
-        role: Role = "PSM_A" if notes["role"] == "PSM_A" else "PSM_M"
+        role: replay_bag.Role = "PSM_A" if notes["role"] == "PSM_A" else "PSM_M"
         rate_hz, number = float(notes["rate_hz"]), notes["pass"]
         frame = plan.frame if role == "PSM_A" else f"{name}_base"
         if not (10 <= rate_hz <= 2000 and (number == "all" or number.isdecimal())):
             raise ValueError(number)
     except (LookupError, ValueError, UnknownInstrument) as error:
         raise BadBag(f"{name}.mcap does not name its role, its instrument and its rate. Export it again.") from error
-    return ArmMotion(
+    return replay_bag.ArmMotion(
         name=name,
         role=role,
         instrument=instrument,
@@ -434,7 +420,7 @@ def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: P
     )
 
 
-def _check_stamps(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
+def _check_stamps(motion: replay_bag.ArmMotion, topics: dict[str, _Topic]) -> None:
     """Check the stamps of all topics.
 
     They are above 0, strictly increasing, no closer than the rate allows, and equal on all three topics and in the log.
@@ -464,7 +450,7 @@ def _check_stamps(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
             )
 
 
-def _check_joints(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
+def _check_joints(motion: replay_bag.ArmMotion, topics: dict[str, _Topic]) -> None:
     """Check that positions and speeds of the joints are within their limits, and that velocities match positions."""
     on_joints, _, on_jaw = topics.values()
     tool = instrument_of(motion.instrument)
@@ -473,21 +459,21 @@ def _check_joints(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
     tick_s = 1.0 / motion.rate_hz  # over a pause too: a robot moves to the next setpoint only when it arrives
     speeds = np.abs(np.diff(joints, axis=0, prepend=joints[:1])) / tick_s / tool.speed
     _check_samples("jumps: it would be faster than its limit", motion, speeds <= SPEED_RATIO)
-    velocities = velocities_of(motion.stamps_ns, motion.joints, motion.rate_hz)
+    velocities = replay_bag.velocities_of(motion.stamps_ns, motion.joints, motion.rate_hz)
     _check_samples(
         "has a velocity that does not match the differences of its positions",
         motion,
         on_joints.values[:, len(JOINTS) :] == velocities,
     )
     low, high = tool.jaw_rad
-    opening = velocities_of(motion.stamps_ns, motion.jaw_rad[:, None], motion.rate_hz)
+    opening = replay_bag.velocities_of(motion.stamps_ns, motion.jaw_rad[:, None], motion.rate_hz)
     if not (((low <= motion.jaw_rad) & (motion.jaw_rad <= high)).all() and (on_jaw.values[:, 1:] == opening).all()):
         raise BadBag(
             f"{motion.name}: the jaw has an angle that the instrument cannot have, or a velocity that does not match."
         )
 
 
-def _check_samples(what: str, motion: ArmMotion, good: Flags) -> None:
+def _check_samples(what: str, motion: replay_bag.ArmMotion, good: Flags) -> None:
     """Raise an error for the first sample and joint that fails a check.
 
     Args:
@@ -504,9 +490,13 @@ def _check_samples(what: str, motion: ArmMotion, good: Flags) -> None:
         )
 
 
-def _check_form(motion: ArmMotion) -> None:
-    """Check that the tip's poses agree with the forward kinematics of the joints."""
-    off_mm, off_rad = _off_the_form(motion)
+def _check_form(motion: replay_bag.ArmMotion) -> float:
+    """Check that the tip's poses agree with the joints' forward kinematics; return their greatest distance in mm."""
+    off_mm = off_rad = np.nan  # as they remain if a quaternion is not of length one
+    if (np.abs(np.linalg.norm(motion.rotation_xyzw, axis=1) - 1.0) <= FORM_RAD).all():
+        tip_mm, rotation = forward(in_mm(motion.joints), motion.instrument)
+        off_mm = float(np.linalg.norm(1000.0 * motion.tip_m - tip_mm, axis=1).max())
+        off_rad = float(angle_between(matrix_of(motion.rotation_xyzw), rotation).max())
     if not (off_mm <= FORM_MM and off_rad <= FORM_RAD):
         raise BadBag(
             f"{motion.name}: {motion.topics[1]} is up to {off_mm:.3g} mm and {off_rad:.3g} rad from the pose at "
@@ -514,41 +504,30 @@ def _check_form(motion: ArmMotion) -> None:
             off_mm=off_mm,
             off_rad=off_rad,
         )
+    return off_mm
 
 
-def _off_the_form(motion: ArmMotion) -> tuple[float, float]:
-    """Return the largest deviations of tip and rotation from the closed form.
-
-    Returns:
-        In mm and rad; NaN if a quaternion is not of length one.
-    """
-    length = np.linalg.norm(motion.rotation_xyzw, axis=1)
-    if not (np.abs(length - 1.0) <= FORM_RAD).all():
-        return np.nan, np.nan
-    tip_mm, rotation = forward(in_mm(motion.joints), motion.instrument)
-    apart_mm = np.linalg.norm(1000.0 * motion.tip_m - tip_mm, axis=1)
-    return float(apart_mm.max()), float(angle_between(matrix_of(motion.rotation_xyzw), rotation).max())
-
-
-def _check_written(motion: ArmMotion, notes: dict[str, str], topics: dict[str, _Topic], plan: PlanPaper) -> None:
+def _check_written(
+    motion: replay_bag.ArmMotion, notes: dict[str, str], topics: dict[str, _Topic], plan: PlanPaper
+) -> None:
     """Write the arm's messages again and compare them byte for byte, which covers names, frames and all else."""
-    if notes != notes_of(motion, plan.sha256):
+    if notes != replay_bag.notes_of(motion, plan.sha256):
         raise BadBag(f"{motion.name}.mcap was made from another plan than {PLAN}. Export the bag again.")
     left = {topic: iter(said.messages) for topic, said in topics.items()}
-    if any(next(left[message.topic]) != message.data for message in messages_of(motion)):
+    if any(next(left[message.topic]) != message.data for message in replay_bag.messages_of(motion)):
         raise BadBag(f"{motion.name}.mcap has other names of joints or frames than the plan. Export the bag again.")
 
 
 # ---- the arms together ------------------------------------------------------------------------------------------
 
 
-def _check_roles(motions: list[ArmMotion], plan: PlanPaper) -> None:
+def _check_roles(motions: list[replay_bag.ArmMotion], plan: PlanPaper) -> None:
     """Check that one arm of the bag executes the plan, and that the other one matches it.
 
     The first must have the plan's arm, instrument, rate and number of samples, and end where the plan does.
     """
     planned = [motion for motion in motions if motion.role == "PSM_A"]
-    if [one.name for one in planned] != [arm_names(plan.arm)[0]]:
+    if [one.name for one in planned] != [replay_bag.arm_names(plan.arm)[0]]:
         raise BadBag(f"The plan is for {plan.arm}, but the bag has another PSM_A, or none.")
     psm_a, other = planned[0], plan.psm_m
     if (psm_a.pass_index or 0) >= len(plan.passes):
@@ -568,7 +547,7 @@ def _check_roles(motions: list[ArmMotion], plan: PlanPaper) -> None:
         raise BadBag("The two arms have different stamps; they would not move together. Export the bag again.")
 
 
-def _check_judged(motion: ArmMotion, report: ReportPaper) -> None:
+def _check_judged(motion: replay_bag.ArmMotion, report: ReportPaper) -> None:
     """Check the accelerations, and that the joints' ranges, speeds and accelerations are those that were judged.
 
     A single pass must stay within those of the whole plan.
@@ -593,9 +572,8 @@ def _check_judged(motion: ArmMotion, report: ReportPaper) -> None:
         )
 
 
-def _describe(motion: ArmMotion) -> str:
+def _describe(motion: replay_bag.ArmMotion, off_mm: float) -> str:
     """Return the summary of an arm's checks, with the bounding box of its motion."""
-    off_mm, _ = _off_the_form(motion)
     low, high = motion.extent_mm.tolist()
     box = ", ".join(f"{axis} [{a:.2f}, {b:.2f}]" for axis, a, b in zip("XYZ", low, high, strict=True))
     seconds = float(motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9

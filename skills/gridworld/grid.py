@@ -86,7 +86,9 @@ class GridWorld:
         cells = np.asarray(cells, np.int64)
         if not (inside := self.holds(cells)).all():
             bad = int(np.count_nonzero(~inside))
-            raise OutsideGrid(f"{bad} of {inside.size} points are outside the grid.", points=bad, first=_first(inside))
+            raise OutsideGrid(
+                f"{bad} of {inside.size} points are outside the grid.", points=bad, first=int(inside.argmin())
+            )
         _, ny, nz = self.shape
         return np.asarray((cells[..., 0] * ny + cells[..., 1]) * nz + cells[..., 2], np.int64)
 
@@ -364,11 +366,6 @@ def _straight(a: Ints, b: Ints) -> Ints:
     """Return the touching cells on the straight line from cell a to cell b, without a and with b."""
     n = int(np.abs(b - a).max())
     return np.floor(a + (b - a) * (np.arange(1, n + 1) / n)[:, None] + 0.5).astype(np.int64)
-
-
-def _first(inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> int:
-    """Return the index of the first point outside the grid."""
-    return int(np.argmin(inside))
 
 
 # ---- the loss of discretisation ------------------------------------------------------------------------------------

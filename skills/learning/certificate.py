@@ -197,8 +197,10 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         optimal, best = optimal_in_scene(mdp_of(policy), policy.greedy, live)
         faint = np.zeros_like(live)
     finishing = finishes(policy)
-    share = shares_of(policy, finishing)
-    covered = Coverage(_reaches(policy, finishing), _joins_nearest(policy), share)
+    greedy, ties = policy.greedy.astype(np.int64), policy.ties
+    off = None if ties is None else off_rule(mdp_of(policy), best, greedy, policy.moves, ties)
+    covered = coverage(policy, finishing)
+    share = covered.share
     certificate = Certificate(
         checked=int(live.sum()),
         suboptimal=int(np.count_nonzero(live & ~optimal)),
@@ -211,7 +213,7 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         median_share=float(np.median(share)),
         demonstration_reproduced=np.array_equal(policy.replay.states, policy.path.states),
         faint=int(np.count_nonzero(faint)),
-        off_rule=_off_rule(policy, best),
+        off_rule=off,
     )
     return certificate, covered
 
@@ -319,13 +321,6 @@ def _achieved(policy: Policy) -> tuple[Floats, Floats]:
     return action_values(mdp, best, policy.moves), best
 
 
-def _off_rule(policy: Policy, values: Floats) -> int | None:
-    """Return the number of actions that the policy's rule does not select; None if it has no rule."""
-    if policy.ties is None:
-        return None
-    return off_rule(mdp_of(policy), values, policy.greedy.astype(np.int64), policy.moves, policy.ties)
-
-
 def finishes(policy: Policy) -> Flags:
     """Return for every row whether the walk from it finishes.
 
@@ -408,22 +403,18 @@ def _fewest_moves(policy: Policy) -> Ints:
     return np.asarray(distance_transform_cdt(away, "chessboard").ravel(), np.int64)
 
 
-def coverage(policy: Policy) -> Coverage:
+def coverage(policy: Policy, finishing: Flags | None = None) -> Coverage:
     """Follow a policy from every state at once.
 
     Args:
         policy: The policy.
+        finishing: What `finishes` returns for it, where it is known.
 
     Returns:
         The success from every start.
     """
-    finishing = finishes(policy)
-    return Coverage(_reaches(policy, finishing), _joins_nearest(policy), shares_of(policy, finishing))
-
-
-def _reaches(policy: Policy, finishing: Flags) -> Flags:
-    rows = policy.domain.start_rows
-    return np.asarray((rows < 0) | finishing[rows])
+    rows, done = policy.domain.start_rows, finishes(policy) if finishing is None else finishing
+    return Coverage((rows < 0) | done[rows], _joins_nearest(policy), shares_of(policy, done))
 
 
 def _joins_nearest(policy: Policy) -> Flags:

@@ -323,12 +323,13 @@ class ValueIteration(PhaseState):
             )
 
 
-def iterate_values(reward: RewardMap, settings: ValueIteration) -> Floats:
+def iterate_values(reward: RewardMap, settings: ValueIteration, hazards: Hazards | None = None) -> Floats:
     """Compute the Q values of a reward map's domain by value iteration.
 
     Args:
         reward: The reward map.
         settings: The settings.
+        hazards: A scene on the path's grid.
 
     Returns:
         Q values, shape (rows, 27).
@@ -337,7 +338,7 @@ def iterate_values(reward: RewardMap, settings: ValueIteration) -> Floats:
         BadSettings: Value iteration does not settle.
     """
     domain = Domain(reward.path, settings.phased, settings.join_share)
-    return exact_q(Mdp(domain, reward, settings.gamma, slip_model(settings.slip)))
+    return exact_q(Mdp(domain, reward, settings.gamma, slip_model(settings.slip), hazards))
 
 
 # ---- compiled loops -------------------------------------------------------------------------------------------------

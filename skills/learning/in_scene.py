@@ -21,15 +21,14 @@ import numpy as np
 from skills.arrays import Floats, freeze
 from skills.errors import BadSettings
 from skills.fields import Count, schema
-from skills.gridworld.domain import Domain
 from skills.gridworld.grid import MOVES
 from skills.gridworld.hazards import Hazards
 from skills.gridworld.reward import RewardMap
-from skills.gridworld.slip import SlipModel, slip_model
+from skills.gridworld.slip import SlipModel
 from skills.learning.certificate import mdp_of, optimal_in_scene
-from skills.learning.dynamic_programming import MAX_SWEEPS, Mdp, ValueIteration, exact_q
-from skills.learning.policy import Learner, Policy, check_learnable
-from skills.learning.q_learning import PhaseQLearning, Training, learn_q
+from skills.learning.dynamic_programming import MAX_SWEEPS, ValueIteration
+from skills.learning.policy import Learner, Policy, learn_values
+from skills.learning.q_learning import PhaseQLearning
 
 SETTLED_ODDS = 1e-13  # a probability that changes by less has settled
 
@@ -100,20 +99,7 @@ def learn_in_scene(
     Raises:
         BadSettings: As for `skills.learning.policy.learn_values`.
     """
-    check_learnable(reward, learner, seed, in_scene=True)
-    if isinstance(learner, PhaseQLearning):
-        q, training = learn_q(reward, learner, seed, hazards)
-        return Policy(reward.path, reward.levels, learner, seed, training, q, surroundings=hazards.surroundings)
-    q = exact_q(
-        Mdp(
-            Domain(reward.path, learner.phased, learner.join_share),
-            reward,
-            learner.gamma,
-            slip_model(learner.slip),
-            hazards,
-        )
-    )
-    training = Training(steps=0, updates=0, episodes=0, finished=0, out_of_steps=0, out_of_time=0, settled=True)
+    q, training = learn_values(reward, learner, seed, hazards)
     return Policy(reward.path, reward.levels, learner, seed, training, q, surroundings=hazards.surroundings)
 
 

@@ -173,7 +173,9 @@ class Space:
         Returns:
             The lengths s and the distances u of the module's docstring, both of shape (N,), in cells.
         """
-        cells = (np.asarray(positions_mm, float)[:, None] - self._from_mm) / self.path.grid.cell_mm  # (N, R - 1, 3)
+        cells = (
+            np.asarray(positions_mm, float)[:, None] - self.path.tip_mm[:-1]
+        ) / self.path.grid.cell_mm  # (N, R - 1, 3)
         share = np.clip((cells * self._legs).sum(axis=-1) / self._lengths**2, 0.0, 1.0)
         off = np.linalg.norm(cells - share[..., None] * self._legs, axis=-1)
         # Rounded, so that distances that differ by a rounding error count as equal.
@@ -200,10 +202,6 @@ class Space:
         progress = np.minimum(gamma * (then - off) - (s - u), 1.0)
         here = progress - DRIFT * off + self.levels.off_grid * stopped
         return np.asarray(here + self.levels.goal * self.arrived(after_mm))
-
-    @cached_property
-    def _from_mm(self) -> Floats:
-        return self.path.tip_mm[:-1]
 
     @cached_property
     def _legs(self) -> Floats:
@@ -242,8 +240,6 @@ class DQN(CellState):
     worlds: int = 8  # parallel episodes: evaluating the network for eight costs the same as for one
 
     def __post_init__(self) -> None:
-        if not 0 < self.gamma < 1:
-            raise BadSettings("gamma must lie in (0, 1).", gamma=self.gamma)
         _check(self)
         if not 1 <= self.target_every <= 10_000_000:
             raise BadSettings("target_every must lie between 1 and 10 000 000.", target_every=self.target_every)
@@ -270,7 +266,6 @@ class DDPG(CellState):
     worlds: int = 8
 
     def __post_init__(self) -> None:
-        _check_discount(self.discount)
         _check(self)
         if not 0 <= self.noise <= 1:
             raise BadSettings("noise must lie between 0 and 1 cell.", noise=self.noise)
@@ -293,7 +288,6 @@ class TRPO(CellState):
     worlds: int = 8
 
     def __post_init__(self) -> None:
-        _check_discount(self.discount)
         _check(self)
         if not 0 < self.trust <= 1:
             raise BadSettings("trust must lie in (0, 1].", trust=self.trust)
@@ -308,13 +302,11 @@ def _check(learner: Deep) -> None:
     for name, most in ranges.items():
         if not 1 <= getattr(learner, name) <= most:
             raise BadSettings(f"{name} must lie between 1 and {most}.", **{name: getattr(learner, name)})
+    discount = "gamma" if isinstance(learner, DQN) else "discount"
+    if not 0 < (share := getattr(learner, discount)) < 1:
+        raise BadSettings(f"{discount} must lie in (0, 1).", **{discount: share})
     if not 0 < learner.learning_rate <= 1:
         raise BadSettings("learning_rate must lie in (0, 1].", learning_rate=learner.learning_rate)
-
-
-def _check_discount(discount: float) -> None:
-    if not 0 < discount < 1:
-        raise BadSettings("discount must lie in (0, 1).", discount=discount)
 
 
 def inputs_of(learner: Deep, reward: RewardMap) -> int:

@@ -81,7 +81,9 @@ def learner_of(described: dict[str, Any]) -> Learner:
     return LEARNERS[kind](**settings)
 
 
-def learn_values(reward: RewardMap, learner: Tabular, seed: int) -> tuple[Floats, Training]:
+def learn_values(
+    reward: RewardMap, learner: Tabular, seed: int, hazards: Hazards | None = None
+) -> tuple[Floats, Training]:
     """Learn the Q values of a reward map's domain.
 
     The same reward map, learner and seed give the same bytes; value iteration and IRL do not use the seed.
@@ -90,6 +92,7 @@ def learn_values(reward: RewardMap, learner: Tabular, seed: int) -> tuple[Floats
         reward: The reward map of the demonstrated path.
         learner: The settings of the learner.
         seed: Seed of all random numbers, 0 to 2^63 - 1.
+        hazards: A scene on the path's grid, which `skills.learning.in_scene.scene_learner` says who can learn in.
 
     Returns:
         Q values, shape (rows, 27), and the counts of the training.
@@ -97,13 +100,13 @@ def learn_values(reward: RewardMap, learner: Tabular, seed: int) -> tuple[Floats
     Raises:
         BadSettings: As for `check_learnable`; or the values do not settle, or the path is too long for the learner.
     """
-    check_learnable(reward, learner, seed)
+    check_learnable(reward, learner, seed, in_scene=hazards is not None)
     if isinstance(learner, ValueIteration):
-        return iterate_values(reward, learner), _without_moving(settled=True)
+        return iterate_values(reward, learner, hazards), Training(settled=True)
     if isinstance(learner, MaxEntIRL):
         # IRL ends after a fixed number of iterations, not when nothing changes.
-        return learn_from_recovered(reward, learner), _without_moving(settled=False)
-    return learn_q(reward, learner, seed)
+        return learn_from_recovered(reward, learner), Training()
+    return learn_q(reward, learner, seed, hazards)
 
 
 def check_learnable(reward: RewardMap, learner: Learner, seed: int, *, in_scene: bool = False) -> None:
@@ -145,11 +148,6 @@ def refuse_too_large(path: GridPath, learner: Learner, *, in_scene: bool = False
             "cells.",
             needed_bytes=needed,
         )
-
-
-def _without_moving(*, settled: bool) -> Training:
-    """Return the counts of a training without moves of an arm."""
-    return Training(steps=0, updates=0, episodes=0, finished=0, out_of_steps=0, out_of_time=0, settled=settled)
 
 
 def refuse_loops(levels: RewardLevels, learner: Learner) -> None:

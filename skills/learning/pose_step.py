@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Floats, Ints, frozen, xyz
+from skills.arrays import Floats, Ints, frozen, xyz, xyzw
 from skills.compiled import compiled, inner
 from skills.errors import BadSettings
 from skills.fields import Point, Quaternion
@@ -98,10 +98,9 @@ def next_pose(
     steps = float(limits.step_mm), float(limits.step_rad), int(limits.ahead)
     step_along(*along, tip, rotation, phases, off, *steps)
     after, (off_mm, off_rad) = int(phases[0]), off[0].tolist()
-    x, y, z, w = rotation[0].tolist()
     return PoseStep(
         xyz(tip[0]),
-        (x, y, z, w),
+        xyzw(rotation[0]),
         None if path.jaw_rad is None else float(path.jaw_rad[after]),
         after,
         float(path.elapsed_s[after]),

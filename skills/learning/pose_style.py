@@ -239,22 +239,18 @@ def learn_pose_style(demos: Sequence[Demo], partners: Sequence[PartnerMotion | N
     frames = sorted({demo.frame for demo in demos})
     if len(frames) > 1:
         raise MixedFrames(f"The demonstrations are in the frames {', '.join(frames)}; choose those in one frame.")
-    phases = np.linspace(0.0, 1.0, PHASES)
-    rotations, jaws = [], []
+    tips, rotations, jaws = [], [], []
     for demo in demos:
         if demo.rotation_xyzw is None:
             raise BadInput(
                 f"The demonstration of {demo.arm} at {demo.start_s:g} s has no orientation, which a pose style needs; "
                 "leave it out."
             )
-        seconds = phases * demo.stamps_s[-1]
-        rotations.append(_turn_at(demo.rotation_xyzw, np.interp(seconds, demo.stamps_s, np.arange(len(demo.stamps_s)))))
+        places = _places(demo)
+        tips.append(_at(demo.tip_mm, places))
+        rotations.append(_turn_at(demo.rotation_xyzw, places))
         if demo.jaw_rad is not None:
-            jaws.append(np.interp(seconds, demo.stamps_s, demo.jaw_rad))
-    tips = [
-        np.stack([np.interp(phases * demo.stamps_s[-1], demo.stamps_s, axis) for axis in demo.tip_mm.T], axis=1)
-        for demo in demos
-    ]
+            jaws.append(_at(demo.jaw_rad, places))
     return PoseStyle(
         frames[0],
         np.stack(tips),
@@ -264,6 +260,12 @@ def learn_pose_style(demos: Sequence[Demo], partners: Sequence[PartnerMotion | N
         _turn_share(np.stack(rotations)),
         None if partners is None else _partners(demos, partners),
     )
+
+
+def _places(demo: Demo) -> Floats:
+    """Return the place of each phase among a demonstration's samples, an index with fraction, (PHASES,)."""
+    seconds = np.linspace(0.0, demo.stamps_s[-1], PHASES)
+    return np.interp(seconds, demo.stamps_s, np.arange(len(demo.stamps_s)))
 
 
 def _partners(demos: Sequence[Demo], partners: Sequence[PartnerMotion | None]) -> tuple[PartnerMotion, ...] | None:
@@ -286,7 +288,7 @@ def _partners(demos: Sequence[Demo], partners: Sequence[PartnerMotion | None]) -
             )
         assert demo.rotation_xyzw is not None, "checked by the caller"
         last = unit(demo.rotation_xyzw[-1]) * INVERSE
-        at = np.interp(np.linspace(0.0, demo.stamps_s[-1], PHASES), demo.stamps_s, np.arange(len(demo.stamps_s)))
+        at = _places(demo)
         seen = multiplied(last, _turn_at(other.rotation_xyzw, at))
         seen_mm, jaw_rad = turned(last, _at(other.tip_mm, at) - demo.tip_mm[-1]), other.jaw_rad
         jaw_rad = None if jaw_rad is None else _at(jaw_rad, at)

@@ -72,7 +72,7 @@ class PhaseQLearning(PhaseState):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(self.alpha, self.gamma, (), self.max_steps, self.max_episode_s, self.step_s)
+        _check(self)
         if not 1 <= self.max_sweeps <= 100_000:
             raise BadSettings("max_sweeps must lie between 1 and 100 000.", max_sweeps=self.max_sweeps)
 
@@ -98,8 +98,9 @@ class CellQLearning(CellState):
     step_s: float = 0.25
 
     def __post_init__(self) -> None:
-        epsilons = (self.epsilon_start, self.epsilon_end)
-        _check(self.alpha, self.gamma, epsilons, self.max_steps, self.max_episode_s, self.step_s)
+        _check(self)
+        if not (0 <= self.epsilon_start <= 1 and 0 <= self.epsilon_end <= 1):
+            raise BadSettings("epsilon must lie in [0, 1].", epsilon=(self.epsilon_start, self.epsilon_end))
         if not 0 < self.epsilon_falls_over <= 1:
             raise BadSettings("epsilon_falls_over must lie in (0, 1].", epsilon_falls_over=self.epsilon_falls_over)
         if not 1 <= self.episodes <= 10_000_000:
@@ -116,7 +117,7 @@ QLearner = PhaseQLearning | CellQLearning
 
 @dataclass(frozen=True)
 class Training:
-    """The counts of a training.
+    """The counts of a training; 0 where no arm is moved.
 
     Attributes:
         steps: Moves of the arm.
@@ -128,26 +129,22 @@ class Training:
         settled: Nothing changed any more at the end.
     """
 
-    steps: Count
-    updates: Count
-    episodes: Count
-    finished: Count
-    out_of_steps: Count
-    out_of_time: Count
-    settled: bool
+    steps: Count = 0
+    updates: Count = 0
+    episodes: Count = 0
+    finished: Count = 0
+    out_of_steps: Count = 0
+    out_of_time: Count = 0
+    settled: bool = False
 
 
-def _check(
-    alpha: float, gamma: float, epsilons: tuple[float, ...], max_steps: int, max_episode_s: float, step_s: float
-) -> None:
-    if not 0 < alpha <= 1:
-        raise BadSettings("alpha must lie in (0, 1].", alpha=alpha)
-    if not 0 < gamma <= 1:
-        raise BadSettings("gamma must lie in (0, 1].", gamma=gamma)
-    if not all(0 <= e <= 1 for e in epsilons):
-        raise BadSettings("epsilon must lie in [0, 1].", epsilon=epsilons)
-    if not 1 <= max_steps <= 1_000_000:
-        raise BadSettings("max_steps must lie between 1 and 1 000 000.", max_steps=max_steps)
+def _check(learner: QLearner) -> None:
+    for name in ("alpha", "gamma"):
+        if not 0 < getattr(learner, name) <= 1:
+            raise BadSettings(f"{name} must lie in (0, 1].", **{name: getattr(learner, name)})
+    if not 1 <= learner.max_steps <= 1_000_000:
+        raise BadSettings("max_steps must lie between 1 and 1 000 000.", max_steps=learner.max_steps)
+    max_episode_s, step_s = learner.max_episode_s, learner.step_s
     if not (isfinite(max_episode_s) and isfinite(step_s) and 0 < step_s <= max_episode_s):
         raise BadSettings("step_s and max_episode_s must be finite, with 0 < step_s <= max_episode_s.")
 

@@ -131,7 +131,7 @@ def walk(controller: Controller, path: GridPath, start: int, slips: Bytes, touch
         The walks.
     """
     runs = slips.shape[1]
-    leads_to = _leads_to(path.grid)
+    after = leads_to(path.grid)
     states, going = np.full(runs, start), np.ones(runs, bool)
     phases, moves, touched = np.zeros(runs, np.int64), np.zeros(runs, np.int64), np.zeros(runs, bool)
     visited = [states]
@@ -145,14 +145,14 @@ def walk(controller: Controller, path: GridPath, start: int, slips: Bytes, touch
             now = going & touches[states, made]
             moves, touched, going = moves + now, touched | now, going & ~now
         # A run that has stopped has a negative action; the state looked up for it is discarded.
-        states = np.where(going, leads_to[states, made], states)
+        states = np.where(going, after[states, made], states)
         moves = moves + going
         visited.append(states)
     return Walks(path, np.stack(visited), moves, None if touches is None else touched)
 
 
-def _leads_to(grid: GridWorld) -> Ints:
-    """Return the state after each state and action, (n_states, 27)."""
+def leads_to(grid: GridWorld) -> Ints:
+    """Return the state after each state and action, (n_states, 27): itself for a move off the grid."""
     here = np.arange(grid.n_states)
     cells = grid.cells_of(here)[:, None] + MOVES
     on_grid = grid.holds(cells)

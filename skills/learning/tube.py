@@ -251,7 +251,7 @@ def _try_update(path: PosePath, limits: TubeLimits, update: Update) -> tuple[int
     side = (phases + 7 * np.tile(np.arange(len(apart)), len(path.tip_mm))) % DIRECTIONS  # 7 has no divisor with 26
     before = Hands(
         path.tip_mm[phases] + sides[side] * off[:, :1],
-        _turned(path.rotation_xyzw[phases], sides[side[::-1]], off[:, 1]),
+        multiplied(path.rotation_xyzw[phases], of_vector(sides[side[::-1]] * off[:, 1:])),
         phases,
     )
     after = update(path, before, limits)
@@ -287,11 +287,6 @@ def _try_update(path: PosePath, limits: TubeLimits, update: Update) -> tuple[int
 def _angles(one_xyzw: Floats, other_xyzw: Floats) -> Floats:
     """Return the angles between orientations, unit quaternions (R, 4), exact also near 0."""
     return angle_of(multiplied(one_xyzw * INVERSE, other_xyzw))
-
-
-def _turned(rotation_xyzw: Floats, axes: Floats, angles: Floats) -> Floats:
-    """Return orientations, (R, 4), turned about their own axes, (R, 3) of length 1, by angles, (R,)."""
-    return multiplied(rotation_xyzw, of_vector(axes * angles[:, None]))
 
 
 def _deciding(step: float, disturbance: float, start: float) -> Floats:

@@ -1,6 +1,6 @@
 """The assumptions and the result of the certificate of a tube, as values: `skills.learning.tube` computes it."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from math import degrees
 
 import numpy as np
@@ -33,15 +33,8 @@ class TubeLimits:
     ahead: int = 1
 
     def __post_init__(self) -> None:
-        numbers = [
-            self.step_mm,
-            self.step_rad,
-            self.disturbance_mm,
-            self.disturbance_rad,
-            self.start_mm,
-            self.start_rad,
-        ]
-        if not (np.isfinite(numbers).all() and min(numbers) >= 0 and 1 <= self.ahead <= 100):
+        *numbers, ahead = astuple(self)
+        if not (np.isfinite(numbers).all() and min(numbers) >= 0 and 1 <= ahead <= 100):
             raise BadSettings("The limits of a tube are finite and not negative, and it looks 1 to 100 phases ahead.")
         if not (self.disturbance_mm < self.step_mm and self.disturbance_rad < self.step_rad):
             raise BadSettings(

@@ -186,12 +186,8 @@ def other_arm(poses: Poses, ticks: Ticks, psm_m: PsmM) -> OtherArm:
     reversed_ = Poses(seen.tip_mm, product(seen.rotation, _HINGE_REVERSED))
     # Both are solved over the complete motion, because the jaws must not change sides on the way.
     either = [solve(one, ticks, psm_m.instrument, "PSM_M") for one in (seen, reversed_)]
-    joints = min(either, key=_most_roll)
+    joints = min(either, key=lambda joints: float(np.abs(joints[:, ROLL]).max()))
     return OtherArm(base_mm, unit(base_xyzw), psm_m.instrument, joints)
-
-
-def _most_roll(joints: Floats) -> float:
-    return float(np.abs(joints[:, ROLL]).max())
 
 
 FAR_MM = 1e4  # ten metres: further than any PSM reaches, and the squares do not overflow

@@ -53,7 +53,7 @@ from math import dist
 import numpy as np
 
 from skills.arithmetic import product
-from skills.arrays import Flags, Floats, Ints, freeze
+from skills.arrays import Flags, Floats, Ints, freeze, interpolated
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
 from skills.errors import BadPlan
@@ -135,7 +135,7 @@ def trace(demo: Demo, path: GridPath) -> SmoothedDemo:
     """
     waypoints = _waypoints(demo.tip_mm, path)
     seconds, tip = smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)
-    calm = np.stack([np.interp(demo.stamps_s, seconds, axis) for axis in tip.T], axis=1)
+    calm = interpolated(demo.stamps_s, seconds, tip)
     bridged = np.setdiff1d(np.arange(len(path.states)), waypoints)
     before = np.searchsorted(waypoints, bridged) - 1
     share = (bridged - waypoints[before]) / (waypoints[before + 1] - waypoints[before])
@@ -182,7 +182,7 @@ def fit_to_demo(followed: Rollout, demonstrated: SmoothedDemo, start_mm: Floats 
         return FittedPath(guide[:1], visits[:1], clock_s[[0, -1]], np.zeros(2))
     grid, cell_mm = followed.path.grid, followed.path.grid.cell_mm
     at, visits = _touching(*_spread(along, visits, cell_mm), grid.cells_of(followed.states))
-    wanted = np.stack([np.interp(at, along, axis) for axis in guide.T], axis=1)
+    wanted = interpolated(at, along, guide)
     centres = followed.tip_mm[visits]
     half = cell_mm * (0.5 - INSIDE)
     away = half + cell_mm * followed.path.hysteresis
@@ -413,10 +413,10 @@ def hand_along(demo: Demo, fitted: FittedPath, *, turning: bool) -> Hand:
     times = times[(times >= clock_s[0]) & (times <= clock_s[-1])]
     recorded_s = np.maximum(times, joins_s)  # during the approach the jaw is as where the path joins
     points = np.arange(len(fitted.tip_mm), dtype=np.float64)
-    grid_s, tip_mm = _calm(times, _at(np.interp(times, clock_s, places), points, fitted.tip_mm), TREMOR_S)
+    grid_s, tip_mm = _calm(times, interpolated(np.interp(times, clock_s, places), points, fitted.tip_mm), TREMOR_S)
     turned, opened = None, None
     if turning and demo.rotation_xyzw is not None:
-        _, turned = _calm(times, _at(recorded_s, demo.stamps_s, same_signs(demo.rotation_xyzw)), TREMOR_S)
+        _, turned = _calm(times, interpolated(recorded_s, demo.stamps_s, same_signs(demo.rotation_xyzw)), TREMOR_S)
         turned = unit(turned)
     if (jaw := jaw_within(demo)) is not None:
         opened = _calm(times, np.interp(recorded_s, demo.stamps_s, jaw)[:, None], TREMOR_S)[1][:, 0]
@@ -506,10 +506,6 @@ def jaw_within(demo: Demo) -> Floats | None:
     return demo.jaw_rad.clip(low, high) if low <= float(np.median(demo.jaw_rad)) <= high else None
 
 
-def _at(times: Floats, seconds: Floats, columns: Floats) -> Floats:
-    return np.stack([np.interp(times, seconds, column) for column in columns.T], axis=1)
-
-
 def styled(followed: Demo, demos: Sequence[Demo]) -> Demo:
     """Return the demonstration that several were combined into, with orientation, jaw and tempo of their pose style.
 
@@ -526,7 +522,7 @@ def styled(followed: Demo, demos: Sequence[Demo]) -> Demo:
     start_xyzw, goal_xyzw = mean_rotation(style.rotation_xyzw[:, [0, -1]], even)
     path = style.between(followed.tip_mm[0], start_xyzw, followed.tip_mm[-1], goal_xyzw)
     elapsed_s = np.interp(_shares(followed.tip_mm), _shares(path.tip_mm), path.elapsed_s)
-    quaternions = _at(elapsed_s, path.elapsed_s, same_signs(path.rotation_xyzw))
+    quaternions = interpolated(elapsed_s, path.elapsed_s, same_signs(path.rotation_xyzw))
     steps_s = np.diff(elapsed_s).clip(LEAST_STEP_S)  # of samples at one place, the second is a moment later
     return replace(
         followed,

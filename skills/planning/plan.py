@@ -40,22 +40,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills import kinematics
 from skills.arithmetic import product
-from skills.arrays import Floats, Ints, freeze, frozen
+from skills.arrays import Floats, Ints, freeze, frozen, xyzw
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan, BadSpeed, OutsideGrid
 from skills.fields import Count, schema
 from skills.gridworld.grid import GridWorld
 from skills.gridworld.scene import Scene
-from skills.kinematics import (
-    POINTING_DOWN,
-    NearestLimit,
-    angle_between,
-    matrix_of,
-    nearest_limit,
-    quaternion_of,
-    reachable,
-)
 from skills.learning.policy import Policy, rollout
 from skills.notebook import card
 from skills.planning.handoff import PsmM, needle_tips_mm, realign
@@ -276,7 +268,7 @@ def stack(
     known = rotation is not None or (demo is not None and demo.rotation_xyzw is not None)
     if rotation is None and demo is not None:
         rotation = rotation_of(demo.rotation_xyzw)
-    jaw = POINTING_DOWN if rotation is None else frozen(rotation, np.float64, (3, 3), "rotation")
+    jaw = kinematics.POINTING_DOWN if rotation is None else frozen(rotation, np.float64, (3, 3), "rotation")
     recorded = None if demo is None else _Recorded(demo, trace(demo, policy.path), turning)
     plan = SuturePlan(
         arm,
@@ -310,7 +302,7 @@ class _Recorded:
     @property
     def last_rotation(self) -> Floats | None:
         """The jaw's [n o a] at the recorded hand-off, shape (3, 3)."""
-        return None if self.demo.rotation_xyzw is None else matrix_of(self.demo.rotation_xyzw[-1:])[0]
+        return None if self.demo.rotation_xyzw is None else kinematics.matrix_of(self.demo.rotation_xyzw[-1:])[0]
 
 
 def _turns(demo: Demo | None, rotation: ArrayLike | None, orientation: Turning | None) -> bool:
@@ -352,9 +344,9 @@ def departure_of(demo: Demo, rotation: Floats | None = None) -> Departure | None
     """
     if demo.rotation_xyzw is None:
         return None
-    seen = matrix_of(demo.rotation_xyzw)
+    seen = kinematics.matrix_of(demo.rotation_xyzw)
     rotation = seen[0] if rotation is None else rotation
-    turn_deg = np.degrees(angle_between(seen, np.broadcast_to(rotation, seen.shape)))
+    turn_deg = np.degrees(kinematics.angle_between(seen, np.broadcast_to(rotation, seen.shape)))
     # The free end is on either side of the jaws, so the further one counts.
     apart_mm = np.linalg.norm(product(seen - rotation, needle_tips_mm().T), axis=1).max(axis=1)
     return Departure(*(float(v) for v in (turn_deg.max(), apart_mm.max(), turn_deg[-1], apart_mm[-1])))
@@ -387,7 +379,7 @@ def _pass(
 ) -> Pass:
     grid = policy.path.grid
     goal = grid.centres_mm(policy.path.goal) if recorded is None else recorded.trace.ends_mm[1]
-    turned = matrix_of(np.array([point.rotation_xyzw]))[0]
+    turned = kinematics.matrix_of(np.array([point.rotation_xyzw]))[0]
     last = recorded.last_rotation if recorded is not None and recorded.turning else None
     # offsets from a given place to the tip, which is the hinge
     at_start, at_end = (
@@ -411,7 +403,7 @@ def _pass(
         path = fit.tip_mm
         hand = moved(hand_along(recorded.demo, fit, turning=recorded.turning), turned, goal, place)
         if hand.rotation_xyzw is not None:
-            held = matrix_of(hand.rotation_xyzw[:1])[0]
+            held = kinematics.matrix_of(hand.rotation_xyzw[:1])[0]
     if np.abs(path[0] - begin).max() > NEGLIGIBLE_MM:
         path = np.concatenate((begin[None], path))
     one = Pass(
@@ -438,7 +430,7 @@ def _with_a2(one: Pass, plan: SuturePlan, recorded: _Recorded | None, goal_mm: F
     target = brought if recorded.turning else product(turned, recorded.last_rotation)
     taken_mm = product(turned, np.array(psm_m.taken_mm) - goal_mm) + one.tip_mm[-1]
     return replace(
-        one, target_rotation=target, taking=Pose(taken_mm, product(turned, matrix_of([psm_m.taken_xyzw])[0]))
+        one, target_rotation=target, taking=Pose(taken_mm, product(turned, kinematics.matrix_of([psm_m.taken_xyzw])[0]))
     )
 
 
@@ -465,7 +457,7 @@ def rotation_of(rotation_xyzw: Floats | None) -> Floats | None:
     Args:
         rotation_xyzw: The demonstration's quaternions, shape (T, 4), or None, which is returned.
     """
-    return None if rotation_xyzw is None else matrix_of(rotation_xyzw[:1])[0]
+    return None if rotation_xyzw is None else kinematics.matrix_of(rotation_xyzw[:1])[0]
 
 
 def turn_deg(one: Pass) -> float:
@@ -476,8 +468,8 @@ def turn_deg(one: Pass) -> float:
     """
     if one.hand is None or one.hand.rotation_xyzw is None:
         return 0.0
-    turned = matrix_of(one.hand.rotation_xyzw)
-    return float(np.degrees(angle_between(turned, np.broadcast_to(turned[0], turned.shape))).max())
+    turned = kinematics.matrix_of(one.hand.rotation_xyzw)
+    return float(np.degrees(kinematics.angle_between(turned, np.broadcast_to(turned[0], turned.shape))).max())
 
 
 def pose_xyzw(rotation: Floats) -> tuple[float, float, float, float]:
@@ -486,8 +478,7 @@ def pose_xyzw(rotation: Floats) -> tuple[float, float, float, float]:
     Args:
         rotation: The rotation, shape (3, 3).
     """
-    x, y, z, w = (float(v) for v in quaternion_of(rotation[None])[0])
-    return x, y, z, w
+    return xyzw(kinematics.quaternion_of(rotation[None])[0])
 
 
 @schema
@@ -510,7 +501,7 @@ class DrivenPass:
     frame: str
     samples: Count
     beyond: Count
-    nearest_limit: NearestLimit
+    nearest_limit: kinematics.NearestLimit
     cell_centres_beyond: Count
     orientation: Orientation
 
@@ -532,14 +523,16 @@ def driven_pass(policy: Policy, demo: Demo) -> DrivenPass:
     (only,) = plan.passes
     (way,) = lay_out(plan.passes, None)
     line, rotation = _driven(way, only.rotation)
-    nearest, beyond = nearest_limit(line, rotation, demo.instrument)
+    nearest, beyond = kinematics.nearest_limit(line, rotation, demo.instrument)
     return DrivenPass(
         path=plan.path,
         frame=demo.frame,
         samples=len(line),
         beyond=beyond,
         nearest_limit=nearest,
-        cell_centres_beyond=int(np.count_nonzero(~reachable(policy.path.tip_mm, only.rotation, demo.instrument))),
+        cell_centres_beyond=int(
+            np.count_nonzero(~kinematics.reachable(policy.path.tip_mm, only.rotation, demo.instrument))
+        ),
         orientation=plan.orientation,
     )
 

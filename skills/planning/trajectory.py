@@ -43,20 +43,9 @@ from skills.arrays import Bytes, Floats, Ints, freeze
 from skills.errors import BadPlan, BadSpeed, NoMotion
 from skills.fields import Count, schema
 from skills.kinematics import DEFAULT_INSTRUMENT, angle_between, forward, instrument_of, matrix_of, quaternion_of
+from skills.planning import motion_laws
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, Jaws, OtherArm, PsmM
-from skills.planning.motion_laws import (
-    A1,
-    A2,
-    PHASES,
-    TRANSFER,
-    Pace,
-    Poses,
-    check_length,
-    followed,
-    held,
-    joined,
-    move,
-)
+from skills.planning.motion_laws import A1, A2, TRANSFER
 from skills.planning.passes import PassPath, Route, Ticks, lay_out, other_arm, solve
 
 __all__ = ["A1", "A2", "MAX_SPEED_MM_S", "TRANSFER", "PassPath", "Trajectory", "joint_ratios", "time_parametrise"]
@@ -67,7 +56,7 @@ PEAK_TURN_RAD_S = radians(45)
 _HEADROOM = 0.98  # each slow-down aims this far below the limits, so that a second one is rarely needed
 _ATTEMPTS = 20
 
-Paces = tuple[Pace, Pace, Pace]  # of each phase
+Paces = tuple[motion_laws.Pace, motion_laws.Pace, motion_laws.Pace]  # of each phase
 
 
 PSM_A, PSM_M = "PSM_A", "PSM_M"  # the names of the two arms: the one that hands over, and the one that takes
@@ -93,10 +82,10 @@ class PlannedArm:
     base: Floats
     base_mm: Floats
 
-    def poses(self, at: Ints | slice = slice(None)) -> Poses:
+    def poses(self, at: Ints | slice = slice(None)) -> motion_laws.Poses:
         """Return the arm's poses at some samples in PSM_A's base frame, by the forward kinematics."""
         tip_mm, rotation = forward(self.joints[at], self.instrument)
-        return Poses(product(tip_mm, self.base.T) + self.base_mm, product(self.base, rotation))
+        return motion_laws.Poses(product(tip_mm, self.base.T) + self.base_mm, product(self.base, rotation))
 
 
 @schema
@@ -158,7 +147,7 @@ class Trajectory:
     psm_m: OtherArm | None = None
     tempo: float | None = None
     jaw_rad: Floats | None = None
-    taking: Poses | None = None
+    taking: motion_laws.Poses | None = None
 
     def __post_init__(self) -> None:
         instrument_of(self.instrument)
@@ -209,7 +198,7 @@ class Trajectory:
         return SampleMoment(
             sample=int(sample),
             pass_index=int(self.pass_index[sample]),
-            phase=PHASES[self.phase[sample]],
+            phase=motion_laws.PHASES[self.phase[sample]],
             stamp_s=float(self.stamps_s[sample]),
         )
 
@@ -259,7 +248,7 @@ def time_parametrise(
     routes = lay_out(passes, psm_m)
     peak_mm_s = _peak_mm_s(routes)
     tempo = 1.0 if peak_mm_s <= speed_mm_s else speed_mm_s / peak_mm_s
-    paces = (Pace(speed_mm_s, PEAK_TURN_RAD_S, rate_hz, tempo),) * 3
+    paces = (motion_laws.Pace(speed_mm_s, PEAK_TURN_RAD_S, rate_hz, tempo),) * 3
     for _ in range(_ATTEMPTS):
         motion = _solved([_sample(one, paces) for one in routes], instrument, psm_m)
         speed, acceleration = _ratios(motion, rate_hz, instrument)
@@ -305,11 +294,13 @@ def _peak_mm_s(routes: Sequence[Route]) -> float:
     return max((hand.peak_mm_s for hand in hands), default=0.0)
 
 
-def _taking(passes: Sequence[PassPath]) -> Poses | None:
+def _taking(passes: Sequence[PassPath]) -> motion_laws.Poses | None:
     recorded = [one.taking for one in passes if one.taking is not None]
     if len(recorded) < len(passes):
         return None
-    return Poses(np.stack([pose.tip_mm for pose in recorded]), np.stack([pose.rotation for pose in recorded]))
+    return motion_laws.Poses(
+        np.stack([pose.tip_mm for pose in recorded]), np.stack([pose.rotation for pose in recorded])
+    )
 
 
 def joint_ratios(
@@ -352,7 +343,7 @@ def _check_rate(rate_hz: float) -> None:
 class _Sampled:
     """One pass in ticks: the poses of each arm, the number of ticks of each phase, and the recorded jaw, if any."""
 
-    poses: tuple[Poses, ...]
+    poses: tuple[motion_laws.Poses, ...]
     counts: tuple[int, int, int]
     deviation_mm: float
     jaw_rad: Floats | None
@@ -362,15 +353,15 @@ class _Sampled:
 def _sample(one: Route, paces: Paces) -> _Sampled:
     """Sample one pass; the end of a phase and the beginning of the next are one tick, at rest."""
     hands = len(one.transfer[-1]) == 2 and one.handed is not None
-    legs = [move(start, end, paces[TRANSFER]) for start, end in pairwise(one.transfer)]
+    legs = [motion_laws.move(start, end, paces[TRANSFER]) for start, end in pairwise(one.transfer)]
     parts = [tuple(poses[:-1] for poses in leg) for leg in legs]  # a leg's last pose is the first of the next part
     begin = one.transfer[-1]
     along, deviation_mm, jaw = _brought(one, paces[A1])
-    parts.append((along, *(held(pose, len(along)) for pose in begin[1:])))
+    parts.append((along, *(motion_laws.held(pose, len(along)) for pose in begin[1:])))
     before = sum(len(leg[0]) for leg in parts[:-1])
     turning = 0
     if one.handed is not None:
-        turned = move(one.brought, one.handed, paces[A2], least_ticks=1)
+        turned = motion_laws.move(one.brought, one.handed, paces[A2], least_ticks=1)
         parts.append(tuple(poses[1:] for poses in turned))
         turning = len(turned[0]) - 1
     other_jaw = None
@@ -378,11 +369,11 @@ def _sample(one: Route, paces: Paces) -> _Sampled:
         rate_hz = paces[A2].rate_hz
         jaw = np.full(len(along), JAW_CLOSED_RAD) if jaw is None else jaw
         given = Jaws.between((JAW_OPEN_RAD, JAW_CLOSED_RAD), (jaw[-1], _let_go(jaw)), rate_hz)
-        parts.append(tuple(held(pose, len(given)) for pose in one.handed))
+        parts.append(tuple(motion_laws.held(pose, len(given)) for pose in one.handed))
         first, first_other = np.full(before, jaw[0]), np.full(before, JAW_OPEN_RAD)
         if one.further:
             taken = Jaws.between((_let_go(jaw), jaw[0]), (JAW_CLOSED_RAD, JAW_OPEN_RAD), rate_hz)
-            parts.insert(len(legs), tuple(held(pose, len(taken)) for pose in begin))
+            parts.insert(len(legs), tuple(motion_laws.held(pose, len(taken)) for pose in begin))
             # the last angles are those of A1's first tick
             first = np.concatenate((np.full(before + 1, _let_go(jaw)), taken.takes_rad[:-1]))
             first_other = np.concatenate((np.full(before + 1, JAW_CLOSED_RAD), taken.gives_rad[:-1]))
@@ -394,7 +385,7 @@ def _sample(one: Route, paces: Paces) -> _Sampled:
         turning += len(given)
     elif jaw is not None:
         jaw = np.concatenate((np.full(before, jaw[0]), jaw, np.full(turning, jaw[-1])))
-    poses = tuple(joined(of_arm) for of_arm in zip(*parts, strict=True))
+    poses = tuple(motion_laws.joined(of_arm) for of_arm in zip(*parts, strict=True))
     return _Sampled(poses, (before, len(along), turning), deviation_mm, jaw, other_jaw)
 
 
@@ -413,7 +404,7 @@ class PassPoses:
         jaw_rad: Angle of PSM_A's jaw, shape (S,); None if it was not recorded.
     """
 
-    arms: tuple[Poses, ...]
+    arms: tuple[motion_laws.Poses, ...]
     phase: Bytes
     jaw_rad: Floats | None
 
@@ -431,7 +422,7 @@ def poses_along(one: PassPath, psm_m: PsmM | None, step_mm: float) -> PassPoses:
         BadPlan: It has no A2, but PSM_M would take the needle there.
     """
     (way,) = lay_out([one], psm_m)
-    fine = _sample(way, (Pace(20.0, PEAK_TURN_RAD_S, RATE_HZ[1] / 10),) * 3)
+    fine = _sample(way, (motion_laws.Pace(20.0, PEAK_TURN_RAD_S, RATE_HZ[1] / 10),) * 3)
     phase = np.repeat(np.array([TRANSFER, A1, A2], np.int8), fine.counts)
     gone = np.zeros(len(phase) - 1)
     for poses in fine.poses:
@@ -442,23 +433,23 @@ def poses_along(one: PassPath, psm_m: PsmM | None, step_mm: float) -> PassPoses:
     ends = np.append(np.flatnonzero(np.diff(phase)), len(phase) - 1)
     at = np.union1d(np.searchsorted(along, wanted - 1e-9).clip(0, len(along) - 1), ends)
     jaw = None if fine.jaw_rad is None else fine.jaw_rad[at]
-    return PassPoses(tuple(Poses(arm.tip_mm[at], arm.rotation[at]) for arm in fine.poses), phase[at], jaw)
+    return PassPoses(tuple(motion_laws.Poses(arm.tip_mm[at], arm.rotation[at]) for arm in fine.poses), phase[at], jaw)
 
 
-def _brought(one: Route, pace: Pace) -> tuple[Poses, float, Floats | None]:
+def _brought(one: Route, pace: motion_laws.Pace) -> tuple[motion_laws.Poses, float, Floats | None]:
     """Return the poses of A1, its greatest distance from its straight moves, and the recorded angles of the jaw."""
     first = one.transfer[-1][0].rotation
     if one.hand is None:
-        tip, deviation_mm = followed(one.line, pace.speed_mm_s / pace.rate_hz)
-        return Poses(tip, np.tile(first, (len(tip), 1, 1))), deviation_mm, None
+        tip, deviation_mm = motion_laws.followed(one.line, pace.speed_mm_s / pace.rate_hz)
+        return motion_laws.Poses(tip, np.tile(first, (len(tip), 1, 1))), deviation_mm, None
     ticks = ceil(one.hand.duration_s / pace.tempo * pace.rate_hz)
-    check_length(ticks)
+    motion_laws.check_length(ticks)
     tip, turned, jaw = one.hand.at(ticks + 1)
     rotation = np.tile(first, (len(tip), 1, 1)) if turned is None else turned
     # without round-off, because transfer and A2 begin and end exactly there
     tip[0], tip[-1] = one.line[0], one.line[-1]
     rotation[0], rotation[-1] = first, one.brought[0].rotation
-    return Poses(tip, rotation), one.hand.deviation_mm, jaw
+    return motion_laws.Poses(tip, rotation), one.hand.deviation_mm, jaw
 
 
 # ---- all passes ------------------------------------------------------------------------------------------------
@@ -468,7 +459,7 @@ def _brought(one: Route, pace: Pace) -> tuple[Poses, float, Floats | None]:
 class _Motion:
     """All passes in ticks, with their joints solved."""
 
-    poses: Poses
+    poses: motion_laws.Poses
     ticks: Ticks
     joints: Floats
     psm_m: OtherArm | None
@@ -479,10 +470,10 @@ class _Motion:
 def _solved(sampled: Sequence[_Sampled], instrument: str, psm_m: PsmM | None) -> _Motion:
     """Concatenate the passes and solve the joints of both arms."""
     counts = np.array([one.counts for one in sampled])
-    check_length(int(counts.sum()))
+    motion_laws.check_length(int(counts.sum()))
     phase = np.repeat(np.tile(np.array([TRANSFER, A1, A2], np.int8), len(counts)), counts.ravel())
     ticks = Ticks(np.repeat(np.arange(len(counts)), counts.sum(axis=1)), phase)
-    poses = [joined(of_arm) for of_arm in zip(*(one.poses for one in sampled), strict=True)]
+    poses = [motion_laws.joined(of_arm) for of_arm in zip(*(one.poses for one in sampled), strict=True)]
     joints = solve(poses[0], ticks, instrument)
     other = None
     if psm_m is not None and len(poses) == 2:
@@ -565,7 +556,7 @@ def seconds_by_phase(trajectory: Trajectory) -> dict[str, float]:
     """
     return {
         name: float(np.count_nonzero(trajectory.phase == phase) / trajectory.rate_hz)
-        for phase, name in enumerate(PHASES)
+        for phase, name in enumerate(motion_laws.PHASES)
     }
 
 

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from skills.arithmetic import wilson
 from skills.arrays import Floats
 from skills.gridworld.grid import GridPath
+from skills.learning.evaluation import dtw
 from skills.report.numbers import LearntStyle, Numbers
 
 if TYPE_CHECKING:
@@ -50,7 +50,6 @@ def draw_styles(styles: Sequence[tuple["DemoPath", "Policy", Sequence["Rollout"]
     """
     rows = ceil(len(styles) / COLUMNS)
     figure = Figure(figsize=(4.4 * min(COLUMNS, len(styles)), 4.3 * rows + 0.3), layout="constrained")
-    FigureCanvasAgg(figure)
     for number, (path, policy, rollouts) in enumerate(styles, start=1):
         _draw_style(space(figure, (rows, COLUMNS, number)), path, policy, rollouts)
     add_legend(figure)
@@ -97,7 +96,6 @@ def draw_all(numbers: Numbers, folder: Path) -> dict[str, Path]:
     for name, draw in DRAWINGS.items():
         files[name] = folder / f"{name}-{numbers.source.name}.png"
         figure = draw(numbers)
-        FigureCanvasAgg(figure)
         figure.savefig(files[name], dpi=DPI)
     return files
 
@@ -150,15 +148,16 @@ def _scale(figure: Figure, axes: Any, dots: Any, rewards: Floats) -> None:
 
 def draw_fig_6(numbers: Numbers) -> Figure:
     """Draw a recorded motion and its path, and the paper's path, whose own recording was not published."""
-    source, found = numbers.source, numbers.fig_6
+    source, recorded = numbers.source, numbers.source.recorded
     panels = 2 if source.recorded_elsewhere else 1
     figure = _figure(6.2 * panels, 5.0)
-    rmse = ", ".join(f"{value:.2f}" for value in found.rmse_mm)
+    rmse = ", ".join(f"{value:.2f}" for value in recorded.rmse_mm)
     title = "a raw recording of the study, of another motion" if source.recorded_elsewhere else source.title
-    axes = _space(figure, (1, panels, 1), f"{title}\n{found.samples} samples, {found.states} states, RMSE {rmse} mm")
-    axes.plot(*source.recorded.tip_mm.T, color=RECORDED, linewidth=1.4, label="raw")
-    _path(axes, source.recorded.path, label=f"discretised, {found.cell_mm:g} mm")
-    _mark_ends(axes, source.recorded.path)
+    counts = f"{len(recorded.tip_mm)} samples, {len(recorded.path.states)} states"
+    axes = _space(figure, (1, panels, 1), f"{title}\n{counts}, RMSE {rmse} mm")
+    axes.plot(*recorded.tip_mm.T, color=RECORDED, linewidth=1.4, label="raw")
+    _path(axes, recorded.path, label=f"discretised, {recorded.path.grid.cell_mm:g} mm")
+    _mark_ends(axes, recorded.path)
     if source.recorded_elsewhere:
         states, revisits = len(source.path.states), source.path.revisits
         axes = _space(
@@ -188,19 +187,16 @@ def draw_fig_8(numbers: Numbers) -> Figure:
     for row, by in enumerate(learners):
         mine = [one for one in numbers.fig_8 if one.by == by]
         for column, one in enumerate(mine, start=1):
-            _draw_learnt(_space(figure, (len(learners), 3, 3 * row + column), _title_of(one)), one)
+            states, end = len(one.rollout.states), "" if one.rollout.finished else ", never arrives"
+            counts = f"{states} states for {len(one.rollout.path.states)}, DTW {one.metrics.dtw_total_mm:g} mm"
+            title = f"{one.by}\n{one.which}: {counts}{end}"
+            _draw_learnt(_space(figure, (len(learners), 3, 3 * row + column), title), one)
     return _titled(figure, f"Fig. 8: three policies of {numbers.source.title}, with DTW", legend=True)
-
-
-def _title_of(one: LearntStyle) -> str:
-    states, of = len(one.rollout.states), len(one.rollout.path.states)
-    end = "" if one.rollout.finished else ", never arrives"
-    return f"{one.by}\n{one.which}: {states} states for {of}, DTW {one.dtw_total_mm:g} mm{end}"
 
 
 def _draw_learnt(axes: Any, one: LearntStyle) -> None:
     path_mm, tip_mm = one.rollout.path.tip_mm, one.rollout.tip_mm
-    for i, j in one.pairs.tolist():
+    for i, j in dtw(tip_mm, path_mm).pairs.tolist():
         axes.plot(*np.stack((tip_mm[i], path_mm[j])).T, color=BLACK, linewidth=0.8, linestyle="--", label="DTW")
     _path(axes, one.rollout.path, width=3.6)
     axes.plot(*tip_mm.T, color=ROLLOUT, linewidth=1.6, marker="o", markersize=2.5, label="learnt")

@@ -24,9 +24,10 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from io import BytesIO
 from itertools import product
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -37,14 +38,14 @@ from skills.demonstration.segments import propose_segments
 from skills.errors import BadInput, BadPath
 from skills.formats import read_recording
 from skills.gridworld import paper
-from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, discretisation_rmse, discretize, fit_grid
+from skills.gridworld.grid import PAPER_GRID, GridPath, discretisation_rmse, discretize, fit_grid
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.certificate import coverage
-from skills.learning.evaluation import dtw, measure
+from skills.learning.evaluation import Metrics, dtw, measure
 from skills.learning.max_ent_irl import MaxEntIRL, recover_reward
 from skills.learning.policy import Policy, Rollout, learn_tabular, rollout, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.learning.slip_runs import replay
+from skills.learning.slip_runs import leads_to, replay
 from skills.packing import sha256
 from skills.planning.plan import SuturePoint, stack
 from skills.report import rivals
@@ -79,6 +80,11 @@ class Recorded:
 
     tip_mm: Floats
     path: GridPath
+
+    @property
+    def rmse_mm(self) -> Triple:
+        """The error of the discretisation along each axis: of the samples against the centres of their cells."""
+        return discretisation_rmse(self.tip_mm, self.path.grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +176,7 @@ def starts_reaching(actions: Ints, path: GridPath) -> int:
 
 def steps_of(actions: Ints, path: GridPath) -> Ints:
     """Return the next state of each state, shape (n_states,): itself at the goal, and for a move off the grid."""
-    grid, here = path.grid, np.arange(path.grid.n_states)
-    cells = grid.cells_of(here) + MOVES[actions]
-    on_grid = grid.holds(cells)
-    after = here.copy()
-    after[on_grid] = grid.states_of(cells[on_grid])
+    after = leads_to(path.grid)[np.arange(path.grid.n_states), actions]
     after[path.goal] = path.goal
     return after
 
@@ -223,31 +225,6 @@ def compare_rewards(path: GridPath, iterations: int) -> RewardFunctions:
     )
 
 
-@dataclass(frozen=True)
-class Discretised:
-    """The path of a recorded motion; the RMSE is of the samples against the centres of their cells."""
-
-    samples: int
-    states: int
-    revisits: int
-    bridged: int
-    cell_mm: float
-    rmse_mm: tuple[float, float, float]
-
-
-def compare_path(recorded: Recorded) -> Discretised:
-    """Compare a recorded motion with its path in the grid."""
-    path = recorded.path
-    return Discretised(
-        samples=len(recorded.tip_mm),
-        states=len(path.states),
-        revisits=path.revisits,
-        bridged=path.bridged,
-        cell_mm=path.grid.cell_mm,
-        rmse_mm=discretisation_rmse(recorded.tip_mm, path.grid),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Stacked:
     """Passes, each of shape (K, 3) in mm, and their suture points, shape (N, 3) in mm.
@@ -269,28 +246,26 @@ def stack_passes(policy: Policy) -> Stacked:
     plan = stack(policy, points, arm="PSM", frame="PSM_base", instrument="any", rotation=None)
     passes = tuple(one.tip_mm for one in plan.passes)
     moved = [path.tip_mm + (point - goal_mm) for point in points_mm]
-    misses = [_miss_mm(one, demonstrated) for one, demonstrated in zip(passes, moved, strict=True)]
+    misses = [
+        float(np.abs(one - demonstrated).max()) if one.shape == demonstrated.shape else inf
+        for one, demonstrated in zip(passes, moved, strict=True)
+    ]
     return Stacked(points_mm, passes, round(max(misses), 9))
-
-
-def _miss_mm(tip_mm: Floats, demonstrated_mm: Floats) -> float:
-    same = tip_mm.shape == demonstrated_mm.shape
-    return float(np.abs(tip_mm - demonstrated_mm).max()) if same else float("inf")
 
 
 @dataclass(frozen=True, eq=False)
 class LearntStyle:
-    """The rollout of a policy or rival from the demonstrated start, its DTW alignment with the demonstration as pairs,
-    shape (K, 2), and the number of starts that reach the goal.
-    """
+    """The rollout of a policy or rival from the demonstrated start, and the number of starts that reach the goal."""
 
     by: str
     which: str
     rollout: Rollout
-    pairs: Ints
-    dtw_total_mm: float
-    exact_states: int
     starts_reaching: int
+
+    @cached_property
+    def metrics(self) -> Metrics:
+        """The rollout compared with the demonstration."""
+        return measure(self.rollout)
 
 
 @dataclass(frozen=True)
@@ -309,23 +284,17 @@ class Tried:
 
 def three_policies(source: FigureSource) -> tuple[LearntStyle, ...]:
     """Return the rollouts of the published policies, if there are any, and of seeds 0, 1 and 2 in either state."""
-    start = source.path.start
-    theirs = [
-        _learnt(
-            PUBLISHED,
-            f"policy {number}",
-            follow(actions, source.path, start),
-            starts_reaching(actions, source.path),
-        )
+    path, reward = source.path, sparse_reward(source.path)
+    styles = [
+        LearntStyle(PUBLISHED, f"policy {number}", follow(actions, path, path.start), starts_reaching(actions, path))
         for number, actions in enumerate(source.published, start=1)
     ]
-    cell, phase = learn_three(source, CellQLearning()), learn_three(source, PhaseQLearning())
-    learnt = [
-        _learnt(by, f"seed {policy.seed}", rollout_from(policy, start), int(coverage(policy).reaches.sum()))
-        for by, policies in ((CELL, cell), (PHASE, phase))
-        for policy in policies
-    ]
-    return (*theirs, *learnt)
+    for by, learner in ((CELL, CellQLearning()), (PHASE, PhaseQLearning())):
+        for seed in SEEDS:
+            policy = learn_tabular(reward, learner, seed)
+            reaching = int(coverage(policy).reaches.sum())
+            styles.append(LearntStyle(by, f"seed {seed}", rollout_from(policy, path.start), reaching))
+    return tuple(styles)
 
 
 def two_rivals(source: FigureSource, primitive: rivals.Primitive) -> tuple[LearntStyle, ...]:
@@ -335,20 +304,9 @@ def two_rivals(source: FigureSource, primitive: rivals.Primitive) -> tuple[Learn
     passes = rivals.rollouts(primitive, everywhere)
     basis = f"{primitive.weights.shape[1]} basis functions"
     return tuple(
-        _learnt(by, which, ways[path.start], sum(way.finished for way in ways))
+        LearntStyle(by, which, ways[path.start], sum(way.finished for way in ways))
         for by, which, ways in ((REPLAY, "as recorded", replays), (PRIMITIVE, basis, passes))
     )
-
-
-def learn_three(source: FigureSource, learner: CellQLearning | PhaseQLearning) -> list[Policy]:
-    """Learn the policies of seeds 0, 1 and 2."""
-    return [learn_tabular(sparse_reward(source.path), learner, seed) for seed in SEEDS]
-
-
-def _learnt(by: str, which: str, followed: Rollout, starts_reaching: int) -> LearntStyle:
-    metrics = measure(followed)
-    pairs = dtw(followed.tip_mm, followed.path.tip_mm).pairs
-    return LearntStyle(by, which, followed, pairs, metrics.dtw_total_mm, metrics.exact_states, starts_reaching)
 
 
 def try_seeds(source: FigureSource, seeds: int) -> tuple[Tried, ...]:
@@ -359,58 +317,47 @@ def try_seeds(source: FigureSource, seeds: int) -> tuple[Tried, ...]:
         PHASE: PhaseQLearning(),
     }
     reward = sparse_reward(source.path)
+    tried = []
     with ThreadPoolExecutor(os.cpu_count()) as threads:  # the compiled loops release the GIL
-        return tuple(
-            _count(by, list(threads.map(partial(_try, reward, learner), range(seeds))))
-            for by, learner in learners.items()
-        )
+        for by, learner in learners.items():
+            rows = list(threads.map(partial(_try, reward, learner), range(seeds)))
+            tables, reached, exact = zip(*rows, strict=True)
+            tried.append(Tried(by, seeds, len(set(tables)), sum(reached), sum(exact)))
+    return tuple(tried)
 
 
-def _try(reward: RewardMap, learner: CellQLearning | PhaseQLearning, seed: int) -> tuple[Rollout, str]:
-    """Return the rollout from the demonstrated start, and the digest of the learnt table."""
+def _try(reward: RewardMap, learner: CellQLearning | PhaseQLearning, seed: int) -> tuple[str, bool, bool]:
+    """Return the digest of the learnt table, and whether its rollout reaches the goal, and follows the path exactly."""
     policy = learn_tabular(reward, learner, seed)
-    return rollout_from(policy, reward.path.start), sha256(policy.q.tobytes())
-
-
-def _count(by: str, tried: Sequence[tuple[Rollout, str]]) -> Tried:
-    rollouts = [followed for followed, _ in tried]
-    exact = [one.finished and np.array_equal(one.states, one.path.states) for one in rollouts]
-    tables = len({table for _, table in tried})
-    return Tried(by, len(rollouts), tables, sum(one.finished for one in rollouts), sum(exact))
+    followed = rollout_from(policy, reward.path.start)
+    exact = followed.finished and np.array_equal(followed.states, reward.path.states)
+    return sha256(policy.q.tobytes()), followed.finished, exact
 
 
 @dataclass(frozen=True, eq=False)
 class OtherStart:
-    """The rollout from another start, and those of the published policies and of the rivals from there.
+    """The rollout from another start, and those of the published policies and of the rivals from there."""
 
-    `joins_at` is the index of the demonstration's state, from 0, from which on ours follows the demonstration.
-    """
-
-    start_mm: tuple[float, float, float]
+    start_mm: Triple
     ours: Rollout
-    joins_at: int
-    dtw_total_mm: float
     published: tuple[Rollout, ...]
     replayed: Rollout
     primitive: Rollout
 
-
-@dataclass(frozen=True)
-class ArrivingStarts:
-    """The number of grid points in the printed range from which a policy reaches the goal."""
-
-    by: str
-    starts: int
-    arriving: int
+    @property
+    def joins_at(self) -> int:
+        """The index of the demonstration's state, from 0, at which ours joins it; the last one if it never does."""
+        joined = self.ours.phases[self.ours.phases > 0]
+        return int(joined[0]) - 1 if len(joined) else len(self.ours.path.states) - 1
 
 
-def range_mm() -> list[tuple[float, float, float]]:
+def range_mm() -> list[Triple]:
     """Return the grid points of the printed range, in mm."""
     axes = [np.arange(min(ends), max(ends) + 1, paper.CELL_MM).tolist() for ends in paper.FIG9_START_RANGE_MM]
     return list(product(*axes))
 
 
-def starts_mm() -> list[tuple[float, float, float]]:
+def starts_mm() -> list[Triple]:
     """Return ten of them; the paper does not list its own."""
     points = range_mm()
     return [points[IN_TURN * number % len(points)] for number in range(N_STARTS)]
@@ -418,43 +365,33 @@ def starts_mm() -> list[tuple[float, float, float]]:
 
 def other_starts(source: FigureSource, policy: Policy, primitive: rivals.Primitive) -> tuple[OtherStart, ...]:
     """Return the rollouts of a policy, of the published ones and of the rivals from each of the ten starts."""
-    return tuple(_from(start_mm, source, policy, primitive) for start_mm in starts_mm())
-
-
-def arriving(source: FigureSource, policy: Policy, primitive: rivals.Primitive) -> tuple[ArrivingStarts, ...]:
-    """Count the starts of the complete range that reach the goal, for the published policies, ours and the rivals."""
-    starts = source.path.grid.states_at(range_mm())
-    states = starts.tolist()
-    theirs = [[follow(actions, source.path, state) for state in states] for actions in source.published]
-    ours = [rollout_from(policy, state) for state in states]
-    named = [
-        *((f"published policy {number}", ways) for number, ways in enumerate(theirs, 1)),
-        ("ours, seed 0", ours),
-        (REPLAY, [replay(source.path, state) for state in states]),
-        (PRIMITIVE, rivals.rollouts(primitive, starts)),
-    ]
-    return tuple(ArrivingStarts(by, len(ways), sum(way.finished for way in ways)) for by, ways in named)
-
-
-def _from(
-    start_mm: tuple[float, float, float], source: FigureSource, policy: Policy, primitive: rivals.Primitive
-) -> OtherStart:
-    ours, state = rollout(policy, start_mm), int(source.path.grid.states_at(start_mm))
-    return OtherStart(
-        start_mm,
-        ours,
-        _joins_at(ours),
-        measure(ours).dtw_total_mm,
-        tuple(follow(actions, source.path, state) for actions in source.published),
-        replay(source.path, state),
-        rivals.rollouts(primitive, np.array([state]))[0],
+    path, starts = source.path, starts_mm()
+    states = path.grid.states_at(starts)
+    primitives = rivals.rollouts(primitive, states)
+    return tuple(
+        OtherStart(
+            start_mm,
+            rollout(policy, start_mm),
+            tuple(follow(actions, path, state) for actions in source.published),
+            replay(path, state),
+            by_primitive,
+        )
+        for start_mm, state, by_primitive in zip(starts, states.tolist(), primitives, strict=True)
     )
 
 
-def _joins_at(followed: Rollout) -> int:
-    """Return the index of the waypoint at which the phase is first above 0; the last one if it never is."""
-    joined = followed.phases[followed.phases > 0]
-    return int(joined[0]) - 1 if len(joined) else len(followed.path.states) - 1
+def arriving(source: FigureSource, policy: Policy, primitive: rivals.Primitive) -> dict[str, int]:
+    """Count the starts of the complete range that reach the goal, for the published policies, ours and the rivals."""
+    starts = source.path.grid.states_at(range_mm())
+    states = starts.tolist()
+    rollouts = {
+        f"published policy {number}": [follow(actions, source.path, state) for state in states]
+        for number, actions in enumerate(source.published, 1)
+    }
+    rollouts["ours, seed 0"] = [rollout_from(policy, state) for state in states]
+    rollouts[REPLAY] = [replay(source.path, state) for state in states]
+    rollouts[PRIMITIVE] = rivals.rollouts(primitive, starts)
+    return {by: sum(way.finished for way in ways) for by, ways in rollouts.items()}
 
 
 # ---- Table I, and all numbers together -----------------------------------------------------------------------------
@@ -569,13 +506,12 @@ class Numbers:
 
     source: FigureSource
     fig_5: RewardFunctions
-    fig_6: Discretised
     fig_7: Stacked
     fig_8: tuple[LearntStyle, ...]
     fig_8_rivals: tuple[LearntStyle, ...]
     tried: tuple[Tried, ...]
     fig_9: tuple[OtherStart, ...]
-    arriving: tuple[ArrivingStarts, ...]
+    arriving: dict[str, int]
     table_1: tuple[Row, ...]
     disturbed: tuple[Disturbed, ...]
 
@@ -589,23 +525,22 @@ def compute(source: FigureSource, effort: Effort) -> Numbers:
     reward, primitive = sparse_reward(source.path), learn_primitive(source.path)
     policy = learn_tabular(reward, PhaseQLearning(), seed=0)
     fig_8 = three_policies(source)
+    printed = [as_printed()] if source.published else []  # only about the paper's user
     return Numbers(
         source=source,
         fig_5=compare_rewards(source.path, effort.irl_iterations),
-        fig_6=compare_path(source.recorded),
         fig_7=stack_passes(policy),
         fig_8=fig_8,
         fig_8_rivals=two_rivals(source, primitive),
         tried=try_seeds(source, effort.seeds),
         fig_9=other_starts(source, policy, primitive),
         arriving=arriving(source, policy, primitive),
-        table_1=_table_1(source, fig_8),
+        table_1=(
+            *printed,
+            *(
+                pooled(by, [one.rollout for one in fig_8 if one.by == by])
+                for by in dict.fromkeys(one.by for one in fig_8)
+            ),
+        ),
         disturbed=disturb(policy, learn_tabular(reward, CellQLearning(), seed=0), primitive, effort.runs),
     )
-
-
-def _table_1(source: FigureSource, fig_8: Sequence[LearntStyle]) -> tuple[Row, ...]:
-    """Return a row for each learner's three policies together; the printed row is only about the paper's user."""
-    learners = dict.fromkeys(one.by for one in fig_8)
-    rows = [pooled(by, [one.rollout for one in fig_8 if one.by == by]) for by in learners]
-    return (as_printed(), *rows) if source.published else tuple(rows)

@@ -17,27 +17,13 @@ from typing import Any
 import numpy as np
 from movement_primitives.dmp import DMP
 
-from skills.arrays import Bytes, Floats, Ints
+from skills.arrays import Bytes, Floats, Ints, interpolated
 from skills.gridworld.grid import MOVES, GridPath
 from skills.gridworld.reward import sparse_reward
 from skills.gridworld.slip import STEADY, slip_model
+from skills.learning import slip_runs
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import Policy, Rollout, learn_tabular
-from skills.learning.slip_runs import (
-    Controller,
-    FollowPolicy,
-    Odds,
-    ReplayMoves,
-    ReplayPositions,
-    SlipOutcome,
-    StartAnew,
-    Walks,
-    budget,
-    judge,
-    odds,
-    shortest_way,
-    walk,
-)
 
 REST_TICKS = 5
 STEPS = 20  # integration steps per tick
@@ -56,7 +42,7 @@ def learn_primitive(path: GridPath) -> Primitive:
     """Learn a path's primitive by ridge regression; nothing is random."""
     ticks = len(path.states) - 1 + REST_TICKS
     at = np.arange(ticks * STEPS + 1) / STEPS
-    shown_mm = np.column_stack([np.interp(at, np.arange(len(path.states)), axis_mm) for axis_mm in path.tip_mm.T])
+    shown_mm = interpolated(at, np.arange(len(path.states), dtype=np.float64), path.tip_mm)
     primitive = _dmp(path, dimensions=3)
     primitive.imitate(at, shown_mm, regularization_coefficient=RIDGE)
     return Primitive(path, np.array(primitive.forcing_term.weights_))
@@ -67,7 +53,7 @@ def _dmp(path: GridPath, dimensions: int) -> Any:
     return DMP(dimensions, execution_time=float(ticks), dt=1 / STEPS, n_weights_per_dim=ticks)
 
 
-def walk_primitive(primitive: Primitive, starts: Ints, slips: Bytes) -> Walks:
+def walk_primitive(primitive: Primitive, starts: Ints, slips: Bytes) -> slip_runs.Walks:
     """Run a primitive from the centres of starts, shape (N,), with slips, shape (moves, N).
 
     A slip replaces the primitive's motion in a tick and moves the arm by one cell; a motion off the grid is not made. A
@@ -92,7 +78,7 @@ def walk_primitive(primitive: Primitive, starts: Ints, slips: Bytes) -> Walks:
         at_mm = np.where(moved[:, None], to_mm, at_mm)
         moves = moves + going
         cells.append(grid.cells_at(at_mm))
-    return Walks(path, grid.states_of(_bridged(np.stack(cells))), moves)
+    return slip_runs.Walks(path, grid.states_of(_bridged(np.stack(cells))), moves)
 
 
 def _many(primitive: Primitive, starts: Ints) -> Any:
@@ -138,7 +124,7 @@ MOVES_REPLAYED, POSITIONS_REPLAYED, PRIMITIVE = (
     "dynamic movement primitive",
 )
 
-Run = Callable[[Bytes], Walks]
+Run = Callable[[Bytes], slip_runs.Walks]
 
 
 @dataclass(frozen=True)
@@ -147,8 +133,8 @@ class Disturbed:
 
     by: str
     slip: float
-    outcome: SlipOutcome
-    exact: Odds | None
+    outcome: slip_runs.SlipOutcome
+    exact: slip_runs.Odds | None
 
 
 def disturb(ours: Policy, cell: Policy, primitive: Primitive, runs: int) -> tuple[Disturbed, ...]:
@@ -157,31 +143,33 @@ def disturb(ours: Policy, cell: Policy, primitive: Primitive, runs: int) -> tupl
 
 
 def _at(slip: float, ours: Policy, cell: Policy, primitive: Primitive, runs: int) -> Iterator[Disturbed]:
-    path, moves = ours.path, budget(ours.path)
+    path, moves = ours.path, slip_runs.budget(ours.path)
     slips = slip_model(slip).draw(runs=runs, moves=moves, seed=SEED)
     solved = learn_tabular(sparse_reward(path, ours.levels), ValueIteration(slip=slip))
     without_drawing = {OURS: ours, SOLVED: solved}
     for by, run in _runners(ours, solved, cell, primitive).items():
-        exact = odds(without_drawing[by], slip_model(slip), path.start, moves) if by in without_drawing else None
-        yield Disturbed(by, slip, judge(run(slips)), exact)
+        exact = (
+            slip_runs.odds(without_drawing[by], slip_model(slip), path.start, moves) if by in without_drawing else None
+        )
+        yield Disturbed(by, slip, slip_runs.judge(run(slips)), exact)
 
 
 def _runners(ours: Policy, solved: Policy, cell: Policy, primitive: Primitive) -> dict[str, Run]:
     """Return all controllers by name, as functions of the slips."""
     path = ours.path
-    plan = shortest_way(path, path.start)
-    controllers: dict[str, Controller] = {
-        OURS: FollowPolicy(ours),
-        SOLVED: FollowPolicy(solved),
-        ANEW: StartAnew(FollowPolicy(ours)),
-        CELL: FollowPolicy(cell),
-        MOVES_REPLAYED: ReplayMoves(path.grid, plan),
-        POSITIONS_REPLAYED: ReplayPositions(path.grid, plan),
+    plan = slip_runs.shortest_way(path, path.start)
+    controllers: dict[str, slip_runs.Controller] = {
+        OURS: slip_runs.FollowPolicy(ours),
+        SOLVED: slip_runs.FollowPolicy(solved),
+        ANEW: slip_runs.StartAnew(slip_runs.FollowPolicy(ours)),
+        CELL: slip_runs.FollowPolicy(cell),
+        MOVES_REPLAYED: slip_runs.ReplayMoves(path.grid, plan),
+        POSITIONS_REPLAYED: slip_runs.ReplayPositions(path.grid, plan),
     }
     runners: dict[str, Run] = {by: _led_by(controller, ours) for by, controller in controllers.items()}
     runners[PRIMITIVE] = lambda slips: walk_primitive(primitive, np.full(slips.shape[1], path.start), slips)
     return runners
 
 
-def _led_by(controller: Controller, ours: Policy) -> Run:
-    return lambda slips: walk(controller, ours.path, ours.path.start, slips)
+def _led_by(controller: slip_runs.Controller, ours: Policy) -> Run:
+    return lambda slips: slip_runs.walk(controller, ours.path, ours.path.start, slips)

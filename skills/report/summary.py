@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from skills.arithmetic import wilson
 from skills.gridworld import paper
 from skills.learning.evaluation import measure
-from skills.report.numbers import Numbers, Row, Triple, as_printed
+from skills.learning.policy import Rollout
+from skills.report.numbers import Numbers, Row, as_printed, range_mm
 
 Cell = str | int | float
+Rows = tuple[tuple[Cell, ...], ...]
+UNKNOWN: tuple[Cell, Cell, Cell] = ("not known", "not known", "not known")
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class Table:
     name: str
     caption: str
     columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: Rows
 
     def __post_init__(self) -> None:
         assert len(set(self.columns)) == len(self.columns), "rows become objects by the names of their columns"
@@ -31,7 +34,7 @@ def tables_of(numbers: Numbers) -> dict[str, tuple[Table, ...]]:
 
 def _fig_5(numbers: Numbers) -> Table:
     found = numbers.fig_5
-    rows: tuple[tuple[Cell, ...], ...] = (
+    rows: Rows = (
         ("iterations of IRL", found.iterations),
         ("negative log-likelihood of the demonstration, all rewards 0 (nat per move)", round(found.nats[0], 4)),
         ("the same with the recovered reward", round(found.nats[1], 4)),
@@ -50,14 +53,15 @@ def _stops(numbers: Numbers) -> str:
 
 
 def _fig_6(numbers: Numbers) -> Table:
-    found = numbers.fig_6
-    rows: tuple[tuple[Cell, ...], ...] = (
-        ("samples", found.samples),
-        ("cell (mm)", found.cell_mm),
-        ("states", found.states),
-        ("states visited before", found.revisits),
-        ("states that no sample lies in", found.bridged),
-        ("RMSE of the samples, x, y, z (mm)", _xyz(found.rmse_mm)),
+    recorded = numbers.source.recorded
+    path = recorded.path
+    rows: Rows = (
+        ("samples", len(recorded.tip_mm)),
+        ("cell (mm)", path.grid.cell_mm),
+        ("states", len(path.states)),
+        ("states visited before", path.revisits),
+        ("states that no sample lies in", path.bridged),
+        ("RMSE of the samples, x, y, z (mm)", _xyz(recorded.rmse_mm)),
     )
     caption = (
         "The raw recording (another motion of the study)" if numbers.source.recorded_elsewhere else "The recording"
@@ -78,10 +82,10 @@ def _fig_8(numbers: Numbers) -> Table:
         (
             one.by,
             one.which,
-            "yes" if one.rollout.finished else "no",
+            _arrives(one.rollout),
             len(one.rollout.states),
-            one.exact_states,
-            one.dtw_total_mm,
+            one.metrics.exact_states,
+            one.metrics.dtw_total_mm,
             one.starts_reaching,
         )
         for one in (*numbers.fig_8, *numbers.fig_8_rivals)
@@ -99,15 +103,15 @@ def _tried(numbers: Numbers) -> Table:
 
 def _fig_9(numbers: Numbers) -> Table:
     theirs = tuple(f"published {number} arrives" for number in range(1, len(numbers.source.published) + 1))
-    rows = (
+    rows: Iterable[tuple[Cell, ...]] = (
         (
             _xyz(one.start_mm),
-            "yes" if one.ours.finished else "no",
+            _arrives(one.ours),
             one.joins_at,
-            one.dtw_total_mm,
-            *("yes" if way.finished else "no" for way in one.published),
+            measure(one.ours).dtw_total_mm,
+            *map(_arrives, one.published),
             *(measure(one.replayed).dtw_total_mm, measure(one.primitive).dtw_total_mm),
-            "yes" if one.primitive.finished else "no",
+            _arrives(one.primitive),
         )
         for one in numbers.fig_9
     )
@@ -118,7 +122,7 @@ def _fig_9(numbers: Numbers) -> Table:
 
 
 def _range(numbers: Numbers) -> Table:
-    rows = ((one.by, one.starts, one.arriving) for one in numbers.arriving)
+    rows = ((by, len(range_mm()), arriving) for by, arriving in numbers.arriving.items())
     return _named("range", numbers, "All grid points of the printed range", ("policy", "starts", "arrive"), rows)
 
 
@@ -134,11 +138,12 @@ def _table_1(numbers: Numbers) -> Table:
 def _ranges(numbers: Numbers) -> Table:
     """Show the values that do not depend on a tie-break: the possible range of each axis's sum."""
     columns = ("trajectories", "axis", "sum (mm)", "least (mm)", "most (mm)")
-    rows = (
-        (_of(one), "xyz"[axis], round(one.sum_mm[axis], 3), _at(one.least_mm, axis), _at(one.most_mm, axis))
+    rows = [
+        (_of(one), "xyz"[axis], round(one.sum_mm[axis], 3), least[axis], most[axis])
         for one in numbers.table_1
+        for least, most in [(one.least_mm or UNKNOWN, one.most_mm or UNKNOWN)]
         for axis in range(3)
-    )
+    ]
     return _named("ranges", numbers, "The same as sums, and all that equally short alignments allow", columns, rows)
 
 
@@ -186,8 +191,8 @@ def _of(row: Row) -> str:
     return f"{row.of} ({row.unfinished} never arrive)" if row.unfinished else row.of
 
 
-def _at(ends: Triple | None, axis: int) -> Cell:
-    return "not known" if ends is None else ends[axis]
+def _arrives(way: Rollout) -> str:
+    return "yes" if way.finished else "no"
 
 
 def printed_rmse() -> Table:

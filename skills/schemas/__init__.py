@@ -4,6 +4,9 @@ Answers and requests of a noun are in one module: `people`, `recordings`, `demos
 The base class of requests and the types of their fields are in `requests`; requests are strict, unknown fields are
 refused. A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
 
+Fields are described in the section Attributes of a class's docstring (`skills.fields.Documented`), unless a number of
+the code is part of the description.
+
 A use case returns the model of its answer; rows store parts of it as typed columns of JSON (`skills.db.AsJson`).
 
 Lengths are mm; the frame of a position is in a field of its own.
@@ -13,9 +16,9 @@ from dataclasses import dataclass
 from reprlib import Repr
 from typing import Annotated, Generic, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
-from skills.fields import Sha256, schema
+from skills.fields import Documented, Sha256, schema
 from skills.gridworld.grid import GridWorld
 
 SHORT = Repr()
@@ -24,7 +27,7 @@ SHORT.maxlist, SHORT.maxtuple, SHORT.maxdict = 4, 4, 12
 SHORT.maxstring, SHORT.maxother = 100, 300
 
 
-class Given(BaseModel):
+class Given(Documented):
     """The base class of responses: a client ignores fields that it does not know yet.
 
     `Model.model_validate(row)` makes one of a row of the database.
@@ -54,10 +57,14 @@ VersionNumber = Annotated[int, Field(ge=1)]
 
 
 class Page(Given, Generic[T]):
-    """One page of a list."""
+    """One page of a list.
+
+    Attributes:
+        next: The `cursor` of the next page; null where this is the last.
+    """
 
     items: list[T]
-    next: int | str | None = Field(description="The `cursor` of the next page; null where this is the last.")
+    next: int | str | None
 
 
 @schema

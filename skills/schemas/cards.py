@@ -18,13 +18,17 @@ from skills.schemas.policies import Combined, Coverage, GridCertificate, Trainin
 
 
 class CardPolicy(Given):
-    """The policy version that the card describes."""
+    """The policy version that the card describes.
+
+    Attributes:
+        training: Digest of the training request that it was learnt by.
+    """
 
     sha256: Sha256
     version: int = Field(ge=1)
     surgeon: Slug
     suture: Slug
-    training: Sha256 = Field(description="Digest of the training request that it was learnt by.")
+    training: Sha256
     created_at: datetime
     arm: str
     frame: str
@@ -47,13 +51,17 @@ class CardRelease(Given):
 
 
 class CardStatus(Given):
-    """The releases of the version, and the version that its style serves now."""
+    """The releases of the version, and the version that its style serves now.
+
+    Attributes:
+        releases: The oldest first.
+    """
 
     released_now: bool
     served_now: PolicyName | None
     releasable: bool
     refused_because: list[str]
-    releases: list[CardRelease] = Field(description="The oldest first.")
+    releases: list[CardRelease]
     in_words: str
 
 
@@ -81,12 +89,17 @@ class CardRecording(Given):
 
 
 class CardDemonstration(Given):
-    """A demonstration that the version was learnt from."""
+    """A demonstration that the version was learnt from.
+
+    Attributes:
+        outcome: What became of the hand-off; null: not known.
+        hysteresis: Cells.
+    """
 
     sha256: Sha256
     state: Literal["active", "withdrawn"]
     withdrawn_at: datetime | None
-    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off; null: not known.")
+    outcome: DemoOutcome | None = None
     outcome_reason: str | None = None
     state_in_words: str
     arm: str
@@ -96,7 +109,7 @@ class CardDemonstration(Given):
     start_s: float
     end_s: float
     session: str | None
-    hysteresis: float = Field(description="Cells.")
+    hysteresis: float
     path_states: Count
     created_at: datetime
     report: DemoReport
@@ -213,12 +226,16 @@ class CardLimits(Given):
 
 
 class CardLink(Given):
-    """One value of the lineage, and the way its digest is computed."""
+    """One value of the lineage, and the way its digest is computed.
+
+    Attributes:
+        digest_of: The input of the digest, as canonical JSON; null if it is not JSON.
+    """
 
     what: str
     sha256: Sha256
     how: str
-    digest_of: Any = Field(description="The input of the digest, as canonical JSON; null if it is not JSON.")
+    digest_of: Any
 
 
 class RestingOnIt(Given):
@@ -246,18 +263,29 @@ class Citation(Given):
 
 
 class CardHistory(Given):
-    """The first signed checkpoint of the history that covers the version; its root proves the version."""
+    """The first signed checkpoint of the history that covers the version; its root proves the version.
 
-    origin: str = Field(description="The name of the log.")
-    size: Count = Field(description="The number of its leaves.")
-    root: Sha256 = Field(description="The root of their tree.")
-    note: str = Field(description="The checkpoint as a C2SP signed note.")
+    Attributes:
+        origin: The name of the log.
+        size: The number of its leaves.
+        root: The root of their tree.
+        note: The checkpoint as a C2SP signed note.
+    """
+
+    origin: str
+    size: Count
+    root: Sha256
+    note: str
 
 
 class PolicyCard(Given):
     """The policy card of one policy version, to attach to a paper; as `text/html` a document with its pictures.
 
     Research use only. It says whether the version is released now, so its ETag changes with that.
+
+    Attributes:
+        demonstrations: The oldest first.
+        combined: How several demonstrations were combined into one path; null for one.
     """
 
     format: int
@@ -270,10 +298,8 @@ class PolicyCard(Given):
     status: CardStatus
     surgeon: CardSurgeon
     suture_type: SutureType
-    demonstrations: list[CardDemonstration] = Field(description="The oldest first.")
-    combined: CardCombined | None = Field(
-        description="How several demonstrations were combined into one path; null for one."
-    )
+    demonstrations: list[CardDemonstration]
+    combined: CardCombined | None
     learner: CardLearner
     metrics: list[CardMetric]
     certificate: GridCertificate

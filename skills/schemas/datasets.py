@@ -13,6 +13,23 @@ class DatasetIn(Schema):
     """A dataset to export: the demonstrations, the part of their recordings, and the contents of its README.
 
     Without `demos`, all demonstrations are meant that fit the filters and the outcomes.
+
+    Attributes:
+        demos: These demonstrations, by their digests; by default all that fit the filters.
+        surgeons: Only of these surgeons.
+        sutures: Only of these suture types.
+        outcomes: success leaves out demonstrations that are marked recovery or failure; any exports them in the splits
+            recovery and failure.
+        whole: Exports whole recordings, where all surgeons in them consent; otherwise an episode is the interval of one
+            hand-off.
+        version: The version of LeRobot's format.
+        fps: Frames per second, at most the rate of the recordings.
+        split: The group that is in one split only: all of a surgeon, or all of a recording.
+        arms: The arms of every episode; left out, those that all of the recordings have.
+        name: The dataset's title.
+        licence: Its licence, such as CC-BY-4.0.
+        description: Its contents, for its README.
+        procedure: The procedure of its collection, for its README.
     """
 
     model_config = shown(
@@ -20,39 +37,19 @@ class DatasetIn(Schema):
         {"demos": ["0123456789abcdef" * 4], "whole": True, "version": "v3.0", "fps": 50, "split": "session"},
     )
 
-    demos: Annotated[list[DigestField], Field(min_length=1, max_length=1000)] | None = Field(
-        default=None, description="These demonstrations, by their digests; by default all that fit the filters."
-    )
-    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = Field(
-        default=None, description="Only of these surgeons."
-    )
-    sutures: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = Field(
-        default=None, description="Only of these suture types."
-    )
-    outcomes: Literal["success", "any"] = Field(
-        default="success",
-        description="success leaves out demonstrations that are marked recovery or failure; any exports them in the "
-        "splits recovery and failure.",
-    )
-    whole: StrictBool = Field(
-        default=False,
-        description="Exports whole recordings, where all surgeons in them consent; otherwise an episode is the "
-        "interval of one hand-off.",
-    )
-    version: Literal["v2.1", "v3.0"] = Field(default="v2.1", description="The version of LeRobot's format.")
-    fps: Annotated[StrictInt, Field(ge=1, le=1000)] = Field(
-        default=30, description="Frames per second, at most the rate of the recordings."
-    )
-    split: Literal["surgeon", "session"] = Field(
-        default="surgeon", description="The group that is in one split only: all of a surgeon, or all of a recording."
-    )
-    arms: Annotated[list[Annotated[str, Field(pattern=ARM)]], Field(min_length=1, max_length=10)] | None = Field(
-        default=None, description="The arms of every episode; left out, those that all of the recordings have."
-    )
-    name: Name = Field(default="Needle hand-offs", description="The dataset's title.")
-    licence: Name = Field(default="unknown", description="Its licence, such as CC-BY-4.0.")
-    description: Text = Field(default="Not stated.", description="Its contents, for its README.")
-    procedure: Text = Field(default="Not stated.", description="The procedure of its collection, for its README.")
+    demos: Annotated[list[DigestField], Field(min_length=1, max_length=1000)] | None = None
+    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
+    sutures: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
+    outcomes: Literal["success", "any"] = "success"
+    whole: StrictBool = False
+    version: Literal["v2.1", "v3.0"] = "v2.1"
+    fps: Annotated[StrictInt, Field(ge=1, le=1000)] = 30
+    split: Literal["surgeon", "session"] = "surgeon"
+    arms: Annotated[list[Annotated[str, Field(pattern=ARM)]], Field(min_length=1, max_length=10)] | None = None
+    name: Name = "Needle hand-offs"
+    licence: Name = "unknown"
+    description: Text = "Not stated."
+    procedure: Text = "Not stated."
 
     @model_validator(mode="after")
     def _named_or_filtered(self) -> Self:
@@ -64,14 +61,22 @@ class DatasetIn(Schema):
 
 
 class DatasetEpisode(Given):
-    """The origin of an episode of a dataset, which names none of this itself."""
+    """The origin of an episode of a dataset, which names none of this itself.
+
+    Attributes:
+        demos: The exported demonstrations in it; one, unless it is a whole recording.
+    """
 
     recording: Sha256
-    demos: list[Sha256] = Field(description="The exported demonstrations in it; one, unless it is a whole recording.")
+    demos: list[Sha256]
 
 
 class DatasetEpisodes(Given):
-    """The origins of a dataset's episodes, in the order of their numbers."""
+    """The origins of a dataset's episodes, in the order of their numbers.
 
-    whole: bool = Field(description="Whether each episode is a whole recording.")
+    Attributes:
+        whole: Whether each episode is a whole recording.
+    """
+
+    whole: bool
     episodes: list[DatasetEpisode]

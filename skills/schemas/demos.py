@@ -65,7 +65,14 @@ class ChosenSegment:
 
 
 class Demonstration(Given):
-    """One hand-off cut out of a recording, with its measurements."""
+    """One hand-off cut out of a recording, with its measurements.
+
+    Attributes:
+        segment: The part of the recording that was cut.
+        hysteresis: Cells.
+        outcome: Of the hand-off; null: not known.
+        outcome_reason: Why, in the words of whoever marked it.
+    """
 
     id: Sha256 = Field(validation_alias=AliasChoices("id", "sha256"))
     sha256: Sha256
@@ -78,26 +85,30 @@ class Demonstration(Given):
     instrument: str
     start_s: float
     end_s: float
-    segment: ChosenSegment = Field(description="The part of the recording that was cut.")
+    segment: ChosenSegment
     session: Slug | None
-    hysteresis: float = Field(description="Cells.")
+    hysteresis: float
     state: Literal["active", "withdrawn"]
-    outcome: DemoOutcome | None = Field(default=None, description="Of the hand-off; null: not known.")
-    outcome_reason: str | None = Field(default=None, description="Why, in the words of whoever marked it.")
+    outcome: DemoOutcome | None = None
+    outcome_reason: str | None = None
     report: DemoReport
     created_at: datetime
     withdrawn_at: datetime | None
 
 
 class DemoPath(Given):
-    """A demonstration as its states in the grid, and as it was recorded."""
+    """A demonstration as its states in the grid, and as it was recorded.
+
+    Attributes:
+        path_mm: The centres of the states.
+    """
 
     demo: Sha256
     frame: str
     grid: ChosenGrid
     hysteresis: float
     states: list[int]
-    path_mm: list[Point] = Field(description="The centres of the states.")
+    path_mm: list[Point]
     stamps_s: list[float]
     recorded_mm: list[Point]
 
@@ -114,41 +125,43 @@ class RewardMap(Given):
 
 
 class DemoIn(Schema):
-    """A demonstration to cut out of a recording: the surgeon, the part, and the grid."""
+    """A demonstration to cut out of a recording: the surgeon, the part, and the grid.
+
+    Attributes:
+        surgeon: The surgeon's pseudonym.
+        suture: The suture type, such as simple-running.
+        arm: Needed if several arms moved.
+        topic: Needed if an arm was recorded on several topics.
+        start_s: Start of the hand-off in the recording.
+        end_s: End of the hand-off in the recording.
+        segment: A proposed hand-off, counted from 1, or whole. Without it and without times the only proposal is taken;
+            of several one must be named; where there is none, the whole recording is taken. The answer says which part
+            it was.
+        grid: auto takes the paper's grid if the path lies in it, and fits one otherwise.
+        cell_mm: Length of a cell's edge in a fitted grid; 5 by default.
+        session: A name for recordings that were made together, such as 2026-11-23-a.
+        outcome: Of the hand-off, where it is known.
+        outcome_reason: Why; needed for a recovery or a failure.
+    """
 
     model_config = shown(
         {"surgeon": "kestrel", "suture": "simple-running"},
         {"surgeon": "kestrel", "suture": "simple-running", "end_s": 1.1, "grid": "fit", "cell_mm": 4.0},
     )
 
-    surgeon: SlugField = Field(description="The surgeon's pseudonym.")
-    suture: SlugField = Field(description="The suture type, such as simple-running.")
-    arm: Name | None = Field(default=None, description="Needed if several arms moved.")
-    topic: Name | None = Field(default=None, description="Needed if an arm was recorded on several topics.")
-    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
-        default=None, description="Start of the hand-off in the recording."
-    )
-    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
-        default=None, description="End of the hand-off in the recording."
-    )
-    segment: Literal["whole"] | Annotated[int, Field(ge=1, le=1_000_000)] | None = Field(
-        default=None,
-        description="A proposed hand-off, counted from 1, or whole. Without it and without times the only proposal is "
-        "taken; of several one must be named; where there is none, the whole recording is taken. The answer says which "
-        "part it was.",
-    )
-    grid: GridMode = Field(
-        default="auto", description="auto takes the paper's grid if the path lies in it, and fits one otherwise."
-    )
-    cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = Field(
-        default=None, description="Length of a cell's edge in a fitted grid; 5 by default."
-    )
+    surgeon: SlugField
+    suture: SlugField
+    arm: Name | None = None
+    topic: Name | None = None
+    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    segment: Literal["whole"] | Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    grid: GridMode = "auto"
+    cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = None
     hysteresis: Hysteresis = 0.0
-    session: SlugField | None = Field(
-        default=None, description="A name for recordings that were made together, such as 2026-11-23-a."
-    )
-    outcome: DemoOutcome | None = Field(default=None, description="Of the hand-off, where it is known.")
-    outcome_reason: Name | None = Field(default=None, description="Why; needed for a recovery or a failure.")
+    session: SlugField | None = None
+    outcome: DemoOutcome | None = None
+    outcome_reason: Name | None = None
 
     @model_validator(mode="after")
     def _reason_with_outcome(self) -> Self:
@@ -159,12 +172,16 @@ class DemoIn(Schema):
 
 
 class OutcomeIn(Schema):
-    """The outcome of a demonstration's hand-off, and its reason."""
+    """The outcome of a demonstration's hand-off, and its reason.
+
+    Attributes:
+        reason: Needed for a recovery or a failure.
+    """
 
     model_config = shown({"outcome": "failure", "reason": "The needle fell."}, {"outcome": "success"})
 
     outcome: DemoOutcome
-    reason: Name | None = Field(default=None, description="Needed for a recovery or a failure.")
+    reason: Name | None = None
 
     @model_validator(mode="after")
     def _why(self) -> Self:
@@ -178,30 +195,39 @@ def _require_reason(outcome: DemoOutcome | None, reason: str | None) -> None:
 
 
 class Proposal(Given):
-    """A proposed hand-off of a recording, and what was decided on it."""
+    """A proposed hand-off of a recording, and what was decided on it.
+
+    Attributes:
+        number: Its number in the recording, counted from 1.
+        state: accepted: a demonstration was cut there, which shares at least half of the longer of the two.
+        start_s: Seconds since the recording's `origin_ns`.
+        handover_s: Transition from A1 to A2.
+        found_by: The source: stage, gesture, transfer, jaw or motion.
+        confidence: Probability that the needle was given to another arm; null unless found by a transfer.
+        surgeon: Of its demonstration, else the only one that the recording was uploaded for.
+        suture: Of its demonstration; null if there is none.
+        demo: The demonstration, active or withdrawn.
+        outcome: Of the demonstration.
+        note: Why it was rejected, or the reason of the outcome.
+        created_at: Of the recording.
+    """
 
     recording: Sha256
-    number: int = Field(description="Its number in the recording, counted from 1.")
-    state: ProposalState = Field(
-        description="accepted: a demonstration was cut there, which shares at least half of the longer of the two."
-    )
+    number: int
+    state: ProposalState
     arm: str
-    start_s: float = Field(description="Seconds since the recording's `origin_ns`.")
+    start_s: float
     end_s: float
-    handover_s: float = Field(description="Transition from A1 to A2.")
-    found_by: str = Field(description="The source: stage, gesture, transfer, jaw or motion.")
+    handover_s: float
+    found_by: str
     reasons: list[str]
-    confidence: Fraction | None = Field(
-        description="Probability that the needle was given to another arm; null unless found by a transfer."
-    )
-    surgeon: Slug | None = Field(
-        description="Of its demonstration, else the only one that the recording was uploaded for."
-    )
-    suture: Slug | None = Field(description="Of its demonstration; null if there is none.")
-    demo: Sha256 | None = Field(description="The demonstration, active or withdrawn.")
-    outcome: DemoOutcome | None = Field(description="Of the demonstration.")
-    note: str | None = Field(description="Why it was rejected, or the reason of the outcome.")
-    created_at: datetime = Field(description="Of the recording.")
+    confidence: Fraction | None
+    surgeon: Slug | None
+    suture: Slug | None
+    demo: Sha256 | None
+    outcome: DemoOutcome | None
+    note: str | None
+    created_at: datetime
 
 
 class ProposalIn(Schema):

@@ -18,22 +18,26 @@ class ServedNow(PolicyName):
 
 
 class Job(Given):
-    """A job: work that was requested, its state and its result."""
+    """A job: work that was requested, its state and its result.
+
+    Attributes:
+        kind: training, retraining, playback, pictures, dataset or try.
+        request: What was asked for, all defaults resolved.
+        result: What came of it. Of a training, `released` says whether its version is what the style serves now,
+            `was_released` whether the job released it, and where a release was asked for, `not_released_because` and
+            `remedy` say why not and what to do. Of a try, `steps` are those so far, also while it runs.
+        served: Of a training: what its style serves now; null where that is nothing.
+        did: Of a POST: what the request did, in words.
+    """
 
     id: str = Field(pattern="^[0-9a-f]{16}$")
-    kind: str = Field(description="training, retraining, playback, pictures, dataset or try.")
+    kind: str
     state: JobState
     progress: Fraction
-    request: dict[str, Any] = Field(description="What was asked for, all defaults resolved.")
-    result: dict[str, Any] | None = Field(
-        description="What came of it. Of a training, `released` says whether its version is what the style serves "
-        "now, `was_released` whether the job released it, and where a release was asked for, `not_released_because` "
-        "and `remedy` say why not and what to do. Of a try, `steps` are those so far, also while it runs."
-    )
-    served: ServedNow | None = Field(
-        default=None, description="Of a training: what its style serves now; null where that is nothing."
-    )
-    did: str | None = Field(default=None, description="Of a POST: what the request did, in words.")
+    request: dict[str, Any]
+    result: dict[str, Any] | None
+    served: ServedNow | None = None
+    did: str | None = None
     error: str | None
     created_at: datetime
     started_at: datetime | None

@@ -37,7 +37,14 @@ class ConsentIn(Schema):
 
 
 class SurgeonIn(Schema):
-    """A surgeon, by pseudonym; never a name."""
+    """A surgeon, by pseudonym; never a name.
+
+    Attributes:
+        skill_level: The surgeon's experience.
+        handedness: The hand that the surgeon prefers.
+        protocol: The study's protocol, such as an ethics number.
+        consent: The uses that the surgeon agreed to.
+    """
 
     model_config = shown(
         {
@@ -48,10 +55,10 @@ class SurgeonIn(Schema):
         {},
     )
 
-    skill_level: SkillLevel | None = Field(default=None, description="The surgeon's experience.")
-    handedness: Handedness | None = Field(default=None, description="The hand that the surgeon prefers.")
-    protocol: Name | None = Field(default=None, description="The study's protocol, such as an ethics number.")
-    consent: ConsentIn | None = Field(default=None, description="The uses that the surgeon agreed to.")
+    skill_level: SkillLevel | None = None
+    handedness: Handedness | None = None
+    protocol: Name | None = None
+    consent: ConsentIn | None = None
 
 
 class SutureType(Given):
@@ -78,12 +85,18 @@ class SutureTypeIn(Schema):
 
 
 class Key(Given):
-    """An API key, as an admin sees it: its owner and permissions; its secret is stored nowhere."""
+    """An API key, as an admin sees it: its owner and permissions; its secret is stored nowhere.
 
-    key: str = Field(pattern=r"^[0-9a-f]{8}$", description="Its id, the part after `skills_`, which is no secret.")
-    owner: str = Field(description="The owner's name, which events and releases record.")
+    Attributes:
+        key: Its id, the part after `skills_`, which is no secret.
+        owner: The owner's name, which events and releases record.
+        surgeons: The surgeons that it is restricted to; null: all.
+    """
+
+    key: str = Field(pattern=r"^[0-9a-f]{8}$")
+    owner: str
     role: Literal["reader", "uploader", "trainer", "releaser", "admin"]
-    surgeons: list[Slug] | None = Field(description="The surgeons that it is restricted to; null: all.")
+    surgeons: list[Slug] | None
     created_at: datetime
     created_by: str
     expires_at: datetime | None
@@ -92,9 +105,13 @@ class Key(Given):
 
 
 class NewKey(Key):
-    """A key that was just created, with its secret."""
+    """A key that was just created, with its secret.
 
-    secret: str = Field(description="The value of the header `X-API-Key`; it cannot be shown again.")
+    Attributes:
+        secret: The value of the header `X-API-Key`; it cannot be shown again.
+    """
+
+    secret: str
 
 
 class KeyIn(Schema):

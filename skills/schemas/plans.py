@@ -25,16 +25,7 @@ from skills.planning.plan import (
 )
 from skills.planning.trajectory import MAX_SPEED_MM_S, Seam, Transfer
 from skills.schemas import Given, PolicyName
-from skills.schemas.requests import (
-    Component,
-    Coordinate,
-    Name,
-    Number,
-    PointIn,
-    Schema,
-    SlugField,
-    shown,
-)
+from skills.schemas.requests import Component, Coordinate, Name, Number, PointIn, QuaternionIn, Schema, SlugField, shown
 from skills.schemas.scenes import SceneIn
 
 
@@ -42,7 +33,7 @@ class SuturePointIn(Schema):
     """The position of a pass's goal, and the rotation of its grid world about this position."""
 
     position_mm: PointIn
-    rotation_xyzw: tuple[Component, Component, Component, Component] = (0.0, 0.0, 0.0, 1.0)
+    rotation_xyzw: QuaternionIn = (0.0, 0.0, 0.0, 1.0)
 
     @property
     def value(self) -> SuturePoint:
@@ -54,26 +45,46 @@ class BaseIn(Schema):
     """The position and rotation of PSM_M's base, its remote centre, in the base frame of the demonstrated arm."""
 
     position_mm: PointIn
-    rotation_xyzw: tuple[Component, Component, Component, Component]
+    rotation_xyzw: QuaternionIn
 
 
 class PsmMIn(Schema):
-    """The arm that takes the needle, in the frame of the arm that was demonstrated."""
+    """The arm that takes the needle, in the frame of the arm that was demonstrated.
 
-    approach: tuple[Component, Component, Component] | None = Field(
-        default=None, description="Its direction towards the needle; left out, the demonstrated one."
-    )
-    base: BaseIn | None = Field(
-        default=None,
-        description="Left out, the demonstrated one; where that is not known, PSM_M is in no scene or bag.",
-    )
+    Attributes:
+        approach: Its direction towards the needle; left out, the demonstrated one.
+        base: Left out, the demonstrated one; where that is not known, PSM_M is in no scene or bag.
+        source: Where these numbers come from; the plan repeats it.
+    """
+
+    approach: tuple[Component, Component, Component] | None = None
+    base: BaseIn | None = None
     instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = None
     enters: Enters = "after_A1"
-    source: Name | None = Field(default=None, description="Where these numbers come from; the plan repeats it.")
+    source: Name | None = None
 
 
 class PlanIn(Schema):
-    """A plan: grid worlds of a style, stacked at suture points."""
+    """A plan: grid worlds of a style, stacked at suture points.
+
+    Attributes:
+        version: The policy version; by default the released one.
+        arm: Refused if it is not the demonstrated one.
+        frame: Refused if it is not the frame of the demonstration.
+        instrument: Refused if it is not the demonstrated one.
+        orientation: recorded: the jaw turns as the surgeon's along the pass; constant: it is held as in the
+            demonstration's first sample, and the answer states the departure. By default recorded where it was.
+        a2: recorded: A2 ends in the demonstrated hand-off, in the poses of both arms; paper: PSM_A turns across PSM_M's
+            approach. By default recorded where both poses were, unless psm_m gives another approach.
+        psm_m: Left out, it is taken from the demonstration where that has PSM_M's pose.
+        scene: Tissue and obstacles in the frame of the arm, against which the verdict compares the motion. Left out, it
+            is the scene that the policy was learnt in.
+        tissue_mm: Height of level tissue, along z of the arm's frame: it is that of the scene. No motion is exported
+            without tissue, of this, of the scene, or of the policy's.
+        realignment: false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now.
+        handoff: none asks for a plan that hands nothing over: A1 alone. Without it a plan is refused for which neither
+            psm_m nor the demonstration says where PSM_M is.
+    """
 
     model_config = shown(
         {
@@ -86,33 +97,23 @@ class PlanIn(Schema):
 
     surgeon: SlugField
     suture: SlugField
-    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = Field(
-        default=None, description="The policy version; by default the released one."
-    )
+    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
     suture_points: Annotated[list[SuturePointIn], Field(min_length=1, max_length=MAX_PASSES)]
     starts_mm: Annotated[list[PointIn | None], Field(max_length=MAX_PASSES)] | None = Field(
         default=None,
         description="Start of each pass; null is the demonstrated start, moved with the grid. "
         f"Up to {MAX_OUTSIDE_MM:g} mm outside a pass's grid world a transfer leads into it.",
     )
-    arm: Name | None = Field(default=None, description="Refused if it is not the demonstrated one.")
-    frame: Name | None = Field(default=None, description="Refused if it is not the frame of the demonstration.")
-    instrument: Name | None = Field(default=None, description="Refused if it is not the demonstrated one.")
+    arm: Name | None = None
+    frame: Name | None = None
+    instrument: Name | None = None
     speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = Field(
         default=20.0,
         description="Greatest speed of the tip: the surgeon's tempo is slowed to it, all along the pass alike. At most "
         f"{MAX_SPEED_MM_S:g}.",
     )
-    orientation: Turning | None = Field(
-        default=None,
-        description="recorded: the jaw turns as the surgeon's along the pass; constant: it is held as in the "
-        "demonstration's first sample, and the answer states the departure. By default recorded where it was.",
-    )
-    a2: A2Target | None = Field(
-        default=None,
-        description="recorded: A2 ends in the demonstrated hand-off, in the poses of both arms; paper: PSM_A turns "
-        "across PSM_M's approach. By default recorded where both poses were, unless psm_m gives another approach.",
-    )
+    orientation: Turning | None = None
+    a2: A2Target | None = None
     rate_hz: Annotated[Number, Field(ge=RATE_HZ[0], le=RATE_HZ[1])] = Field(
         default=200.0, description=f"Samples per second, {RATE_HZ[0]:g} to {RATE_HZ[1]:g}."
     )
@@ -121,27 +122,11 @@ class PlanIn(Schema):
         description=f"How far down the jaw's approach from its hinge suture points and starts are meant; "
         f"{JAW_TIP_MM:g} for the finger tips.",
     )
-    psm_m: PsmMIn | None = Field(
-        default=None, description="Left out, it is taken from the demonstration where that has PSM_M's pose."
-    )
-    scene: SceneIn | None = Field(
-        default=None,
-        description="Tissue and obstacles in the frame of the arm, against which the verdict compares the motion. Left "
-        "out, it is the scene that the policy was learnt in.",
-    )
-    tissue_mm: Coordinate | None = Field(
-        default=None,
-        description="Height of level tissue, along z of the arm's frame: it is that of the scene. No motion is "
-        "exported without tissue, of this, of the scene, or of the policy's.",
-    )
-    realignment: StrictBool = Field(
-        default=True, description="false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now."
-    )
-    handoff: Literal["none"] | None = Field(
-        default=None,
-        description="none asks for a plan that hands nothing over: A1 alone. Without it a plan is refused for which "
-        "neither psm_m nor the demonstration says where PSM_M is.",
-    )
+    psm_m: PsmMIn | None = None
+    scene: SceneIn | None = None
+    tissue_mm: Coordinate | None = None
+    realignment: StrictBool = True
+    handoff: Literal["none"] | None = None
 
 
 class Sources(Given):
@@ -152,44 +137,58 @@ class Sources(Given):
 
 
 class PsmM(Given):
-    """The arm that takes the needle, in the frame of the arm that hands it over."""
+    """The arm that takes the needle, in the frame of the arm that hands it over.
+
+    Attributes:
+        enters: start or after_A1.
+    """
 
     approach: Point
     base_mm: Point | None
     base_xyzw: Quaternion | None
     instrument: str
-    enters: str = Field(description="start or after_A1.")
+    enters: str
     from_: Sources = Field(alias="from")
 
 
 class Pass(Given):
-    """One grid world of a plan: its placement, and the path in it."""
+    """One grid world of a plan: its placement, and the path in it.
+
+    Attributes:
+        jaw_xyzw: The jaw at the start of A1.
+        turn_deg: Greatest angle of the jaw from its start during A1.
+        target_xyzw: The jaw after A2; null where A1 alone is planned.
+    """
 
     position_mm: Point
     rotation_xyzw: Quaternion
     start_mm: Point
     states: list[int]
     path_mm: list[Point]
-    jaw_xyzw: Quaternion = Field(description="The jaw at the start of A1.")
-    turn_deg: float = Field(description="Greatest angle of the jaw from its start during A1.")
-    target_xyzw: Quaternion | None = Field(description="The jaw after A2; null where A1 alone is planned.")
+    jaw_xyzw: Quaternion
+    turn_deg: float
+    target_xyzw: Quaternion | None
     transfer: Transfer | None
 
 
 class Timetable(Given):
-    """A plan as a function of time."""
+    """A plan as a function of time.
+
+    Attributes:
+        duration_s: From the first sample to the last, with the pauses between passes.
+        seconds_by_phase: Samples of each phase divided by `rate_hz`, without pauses: of a pass a sample more than it
+            lasts.
+        tempo: The part of the surgeon's tempo in A1, at most 1; null where none is followed.
+        jaw: recorded along A1, or constant.
+    """
 
     rate_hz: float
     samples: Count
-    duration_s: float = Field(description="From the first sample to the last, with the pauses between passes.")
-    seconds_by_phase: dict[str, float] = Field(
-        description="Samples of each phase divided by `rate_hz`, without pauses: of a pass a sample more than it lasts."
-    )
+    duration_s: float
+    seconds_by_phase: dict[str, float]
     speed_used_mm_s: float
-    tempo: float | None = Field(
-        description="The part of the surgeon's tempo in A1, at most 1; null where none is followed."
-    )
-    jaw: str = Field(description="recorded along A1, or constant.")
+    tempo: float | None
+    jaw: str
     peak_joint_speed_ratio: float
     peak_joint_acceleration_ratio: float
     deviation_mm: float
@@ -198,36 +197,41 @@ class Timetable(Given):
 
 
 class PlanScene(Given):
-    """The scene of a plan, in the frame of the arm; it does not move with the passes."""
+    """The scene of a plan, in the frame of the arm; it does not move with the passes.
+
+    Attributes:
+        learnt_sha256: Of the scene that the policy was learnt in; null: in none.
+        differs: The differences from that scene, in words; empty if there are none.
+    """
 
     sha256: Sha256
-    learnt_sha256: Sha256 | None = Field(description="Of the scene that the policy was learnt in; null: in none.")
-    differs: list[str] = Field(description="The differences from that scene, in words; empty if there are none.")
+    learnt_sha256: Sha256 | None
+    differs: list[str]
     scene: Scene
 
 
 class PlanDescription(Given):
-    """What a plan does, without its digests."""
+    """What a plan does, without its digests.
+
+    Attributes:
+        orientation: recorded: turns as the surgeon's; demonstrated: constant, the demonstration's first; or assumed
+            tool-down, which is constant too.
+        departure: Of a constant orientation from the recorded one; null where there is none.
+        a2: recorded: ends in the demonstrated hand-off; or paper. Null without a hand-off.
+        path: fitted, or cell centres.
+        scene: Tissue and obstacles; null: none was stated, and nothing is compared with them.
+    """
 
     arm: str
     frame: str
     instrument: str
-    orientation: str = Field(
-        description="recorded: turns as the surgeon's; demonstrated: constant, the demonstration's first; or assumed "
-        "tool-down, which is constant too."
-    )
-    departure: Departure | None = Field(
-        description="Of a constant orientation from the recorded one; null where there is none."
-    )
-    a2: str | None = Field(
-        description="recorded: ends in the demonstrated hand-off; or paper. Null without a hand-off."
-    )
-    path: str = Field(description="fitted, or cell centres.")
+    orientation: str
+    departure: Departure | None
+    a2: str | None
+    path: str
     psm_m: PsmM | None
     realignment: bool
-    scene: PlanScene | None = Field(
-        description="Tissue and obstacles; null: none was stated, and nothing is compared with them."
-    )
+    scene: PlanScene | None
     speed_mm_s: float
     tip_offset_mm: float
     passes: list[Pass]
@@ -240,20 +244,30 @@ class PlanDescription(Given):
 
 
 class Plan(PlanDescription):
-    """Grid worlds stacked at suture points."""
+    """Grid worlds stacked at suture points.
+
+    Attributes:
+        hands_over: Whether a hand-off is planned: A2 towards PSM_M.
+        in_words: What the plan does and what it leaves out.
+    """
 
     id: Sha256
     sha256: Sha256
     surgeon: Slug
     suture: Slug
     policy: PolicyName
-    hands_over: bool = Field(description="Whether a hand-off is planned: A2 towards PSM_M.")
-    in_words: str = Field(description="What the plan does and what it leaves out.")
+    hands_over: bool
+    in_words: str
     created_at: datetime
 
 
 class PlanSummary(Given):
-    """A plan in a list."""
+    """A plan in a list.
+
+    Attributes:
+        playback: Its newest playback; null where it was not played.
+        feasible: Of that playback.
+    """
 
     id: Sha256
     surgeon: Slug
@@ -261,8 +275,8 @@ class PlanSummary(Given):
     policy: PolicyName
     passes: Count
     hands_over: bool
-    playback: Sha256 | None = Field(description="Its newest playback; null where it was not played.")
-    feasible: bool | None = Field(description="Of that playback.")
+    playback: Sha256 | None
+    feasible: bool | None
     created_at: datetime
 
 

@@ -28,27 +28,38 @@ class ErrorSources(Schema):
 
 
 class ArmErrorsIn(Schema):
-    """A laboratory's own errors of its arms, standard deviations along or about each axis (docs/errors.md)."""
+    """A laboratory's own errors of its arms, standard deviations along or about each axis (docs/errors.md).
+
+    Attributes:
+        registration_mm: Offset of PSM_M's base.
+        registration_deg: Rotation of PSM_M's base about its remote centre.
+        wrist_deg: Rotation of either arm's jaws about their hinge.
+        tip_bias_mm: Offset of either arm that stays over a pass.
+        tip_noise_mm: Offset of either arm that varies during a pass.
+        tip_correlation_s: Correlation time of that noise.
+    """
 
     name: Annotated[str, Field(min_length=1, max_length=60, pattern=LINE)]
-    registration_mm: Size = Field(description="Offset of PSM_M's base.")
-    registration_deg: Size = Field(description="Rotation of PSM_M's base about its remote centre.")
-    wrist_deg: Size = Field(description="Rotation of either arm's jaws about their hinge.")
-    tip_bias_mm: Size = Field(description="Offset of either arm that stays over a pass.")
-    tip_noise_mm: Size = Field(description="Offset of either arm that varies during a pass.")
-    tip_correlation_s: Size = Field(description="Correlation time of that noise.")
+    registration_mm: Size
+    registration_deg: Size
+    wrist_deg: Size
+    tip_bias_mm: Size
+    tip_noise_mm: Size
+    tip_correlation_s: Size
     sources: ErrorSources
 
 
 class PlaybackIn(Schema):
-    """A playback: the plan to play in the simulator, and the errors of the arms to judge it under."""
+    """A playback: the plan to play in the simulator, and the errors of the arms to judge it under.
+
+    Attributes:
+        errors: The errors of the arms that are to play it; by default those of the installation.
+    """
 
     model_config = shown({"plan": "0123456789abcdef" * 4}, {"plan": "0123456789abcdef" * 4, "errors": "calibrated"})
 
     plan: DigestField
-    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = Field(
-        default=None, description="The errors of the arms that are to play it; by default those of the installation."
-    )
+    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = None
 
     @property
     def arm_errors(self) -> ArmErrors | None:
@@ -64,8 +75,8 @@ class Verdict(PlaybackReport):
     """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
 
     Attributes:
-        failure_in_words: The failure as a sentence.
-        doubt: Probabilities of success in worlds that differ from the plan.
+        failure_sentence: The failure as a sentence.
+        estimate: Probabilities of success in worlds that differ from the plan.
         plan: Digest of the plan.
         trajectory: Digest of the stamps and joints that were checked.
         policy: The policy version that the plan follows.
@@ -76,8 +87,8 @@ class Verdict(PlaybackReport):
         check_version: Version of the checks; a bag is given only of the present one.
     """
 
-    failure_in_words: str | None
-    doubt: SuccessEstimate
+    failure_sentence: str | None
+    estimate: SuccessEstimate
     plan: Sha256
     trajectory: Sha256
     policy: PolicyName
@@ -121,33 +132,41 @@ CountedEvent = Literal["hand-over", "clearance"]
 
 
 class Headline(Given):
-    """A playback's headline: the verdict, the missing parts of the plan, and its probability of success."""
+    """A playback's headline: the verdict, the missing parts of the plan, and its probability of success.
 
-    level: Level = Field(
-        description="good: hands over, and succeeds as surely as the installation asks for a replay; bad: not "
-        "feasible, or surely succeeds in less than half of the worlds."
-    )
-    word: str = Field(description="The level in a word or two.")
+    Attributes:
+        level: good: hands over, and succeeds as surely as the installation asks for a replay; bad: not feasible, or
+            surely succeeds in less than half of the worlds.
+        word: The level in a word or two.
+        errors: Name of the errors of the arms: those of the playback's request, or else of the installation.
+        probability: Of the whole plan; null where it was not judged.
+        counts: The event of the probability: the needle is handed over in every pass, or, without a hand-off, the
+            motion only stays within reach and clear; null where it was not judged.
+        not_judged: What the probability leaves out, in words.
+        costs_most: The error that costs the most, in words; null where none was judged.
+    """
+
+    level: Level
+    word: str
     text: str
-    errors: str = Field(
-        description="Name of the errors of the arms: those of the playback's request, or else of the installation."
-    )
-    probability: Probability | None = Field(description="Of the whole plan; null where it was not judged.")
-    counts: CountedEvent | None = Field(
-        description="The event of the probability: the needle is handed over in every pass, or, without a hand-off, "
-        "the motion only stays within reach and clear; null where it was not judged.",
-    )
-    not_judged: list[str] = Field(description="What the probability leaves out, in words.")
-    costs_most: str | None = Field(description="The error that costs the most, in words; null where none was judged.")
+    errors: str
+    probability: Probability | None
+    counts: CountedEvent | None
+    not_judged: list[str]
+    costs_most: str | None
 
 
 class Playback(Given):
-    """The simulator's verdict on a plan."""
+    """The simulator's verdict on a plan.
+
+    Attributes:
+        feasible: In an exact simulation, as far as the plan goes; read `headline`.
+    """
 
     id: Sha256
     sha256: Sha256
     plan: Sha256
-    feasible: bool = Field(description="In an exact simulation, as far as the plan goes; read `headline`.")
+    feasible: bool
     headline: Headline
     report: Verdict
     picture: str
@@ -157,15 +176,20 @@ class Playback(Given):
 
 
 class Comparison(Given):
-    """A recorded replay compared with a pass of its plan; triples are x, y and z."""
+    """A recorded replay compared with a pass of its plan; triples are x, y and z.
+
+    Attributes:
+        start_mm: Between the first samples.
+        end_mm: Between the last samples.
+    """
 
     plan: Sha256
     demo: Sha256
     pass_index: Count = Field(alias="pass")
     mean_mm: float
     max_mm: float
-    start_mm: float = Field(description="Between the first samples.")
-    end_mm: float = Field(description="Between the last samples.")
+    start_mm: float
+    end_mm: float
     dtw_mean_mm: Point
     rmse_mm: Point
     planned_s: float

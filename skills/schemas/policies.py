@@ -204,17 +204,35 @@ class PolicySummary(Version):
 
 
 class PhaseActions(Given):
-    """The actions of one phase: those of a box of cells; outside the box the action is -2."""
+    """The actions of one phase: those of a box of cells; outside the box the action is -2.
 
-    low: list[int] = Field(min_length=3, max_length=3, description="The lowest cell of the box.")
-    size: list[int] = Field(min_length=3, max_length=3, description="Number of cells of the box along x, y and z.")
-    actions: list[int] = Field(description="By cell of the box, that along z running fastest, then y, then x.")
+    Attributes:
+        low: The lowest cell of the box.
+        size: Number of cells of the box along x, y and z.
+        actions: By cell of the box, that along z running fastest, then y, then x.
+    """
+
+    low: list[int] = Field(min_length=3, max_length=3)
+    size: list[int] = Field(min_length=3, max_length=3)
+    actions: list[int]
 
 
 class PolicyManifest(Given):
     """The description of a policy without its numbers; its version's digest covers both.
 
     Attributes without a value are left out of the digest, so that one that is added later changes no digest.
+
+    Attributes:
+        waypoints: State index of each, in order.
+        learner: Kind of the learner.
+        settings: Of the learner: which there are depends on its kind.
+        combined: Where it was learnt from several demonstrations.
+        rollouts: Where it was learnt in the continuous space.
+        outcomes: Where it was trained from demonstrations of any outcome: that of each as it was then.
+        joining: Where a pass joins the path; null: at the nearest waypoint, see above.
+        ties: The rule among equally good actions; null: the lowest index. The actions follow it: take them, and not the
+            first largest of the Q values in the arrays.
+        scene: What must not be touched, where it was learnt so; null: nothing was known of it.
     """
 
     surgeon: Slug
@@ -225,11 +243,11 @@ class PolicyManifest(Given):
     grid: Grid
     start_mm: Point
     goal_mm: Point
-    waypoints: list[int] = Field(description="State index of each, in order.")
+    waypoints: list[int]
     phases: int = Field(ge=1)
-    learner: str = Field(description="Kind of the learner.")
+    learner: str
     learner_version: int
-    settings: dict[str, Any] = Field(description="Of the learner: which there are depends on its kind.")
+    settings: dict[str, Any]
     reward_levels: RewardLevels
     seed: Count
     demos: list[Sha256]
@@ -237,23 +255,12 @@ class PolicyManifest(Given):
     metrics: Metrics
     coverage: Coverage
     grid_certificate: GridCertificate
-    combined: Combined | None = Field(default=None, description="Where it was learnt from several demonstrations.")
-    rollouts: SpaceRollouts | None = Field(default=None, description="Where it was learnt in the continuous space.")
-    outcomes: list[DemoOutcome | None] | None = Field(
-        default=None,
-        description="Where it was trained from demonstrations of any outcome: that of each as it was then.",
-    )
-    joining: Joining | None = Field(
-        default=None, description="Where a pass joins the path; null: at the nearest waypoint, see above."
-    )
-    ties: ShortestApproach | None = Field(
-        default=None,
-        description="The rule among equally good actions; null: the lowest index. The actions follow it: "
-        "take them, and not the first largest of the Q values in the arrays.",
-    )
-    scene: PolicyScene | None = Field(
-        default=None, description="What must not be touched, where it was learnt so; null: nothing was known of it."
-    )
+    combined: Combined | None = None
+    rollouts: SpaceRollouts | None = None
+    outcomes: list[DemoOutcome | None] | None = None
+    joining: Joining | None = None
+    ties: ShortestApproach | None = None
+    scene: PolicyScene | None = None
 
     @property
     def style(self) -> tuple[str, str]:
@@ -305,20 +312,28 @@ class Policy(PolicyManifest, PolicyName):
     With `scene`, -2 stands also in cells that are forbidden there, and where the best move would touch; a client stops
     as outside the certified domain. The straight lines between the centres of the cells were checked, not smoothed
     ones, and the odds are those of a client that stops.
+
+    Attributes:
+        actions: By phase, then by state; null where there are over 10^6.
+        live_actions: Where `actions` is null: the actions of the certified domain, by phase.
+        arrays: Where the arrays with the Q values are.
     """
 
     created_at: datetime
     released_at: datetime | None
     released_by: str | None
-    actions: list[list[int]] | None = Field(description="By phase, then by state; null where there are over 10^6.")
-    live_actions: list[PhaseActions] | None = Field(
-        description="Where `actions` is null: the actions of the certified domain, by phase."
-    )
-    arrays: str = Field(description="Where the arrays with the Q values are.")
+    actions: list[list[int]] | None
+    live_actions: list[PhaseActions] | None
+    arrays: str
 
 
 class Rollout(PolicyName):
-    """The path from a position to the goal."""
+    """The path from a position to the goal.
+
+    Attributes:
+        finishing: Of a policy learnt in a scene: the probability that a pass from here finishes.
+        touching: Likewise: the probability that it touches the scene.
+    """
 
     frame: str
     states: list[int]
@@ -326,23 +341,27 @@ class Rollout(PolicyName):
     path_mm: list[Point]
     finished: bool
     dtw_total_mm: float
-    finishing: Fraction | None = Field(
-        default=None, description="Of a policy learnt in a scene: the probability that a pass from here finishes."
-    )
-    touching: Fraction | None = Field(default=None, description="Likewise: the probability that it touches the scene.")
+    finishing: Fraction | None = None
+    touching: Fraction | None = None
 
 
 class NextStep(PolicyName):
-    """The next step of the policy at a position."""
+    """The next step of the policy at a position.
+
+    Attributes:
+        phase: After counting this position.
+        action: null where the policy has finished, or does not know.
+        correction_mm: The way back to the path; null on it.
+    """
 
     frame: str
-    phase: Count = Field(description="After counting this position.")
-    action: int | None = Field(description="null where the policy has finished, or does not know.")
+    phase: Count
+    action: int | None
     next_position_mm: Point | None
     next_phase: int | None
     done: bool
     confidence: float
-    correction_mm: Point | None = Field(description="The way back to the path; null on it.")
+    correction_mm: Point | None
 
 
 class RolloutIn(Schema):

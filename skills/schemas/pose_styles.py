@@ -9,7 +9,7 @@ from skills.demonstration.partner import Partner
 from skills.fields import Count, Point, Quaternion, Sha256, Slug
 from skills.learning.tube_certificate import TubeCertificate, TubeClearance
 from skills.schemas import Given, PolicyName
-from skills.schemas.requests import Component, PointIn, Schema, shown
+from skills.schemas.requests import PointIn, QuaternionIn, Schema, shown
 
 
 class PartnerPose(Given):
@@ -17,12 +17,16 @@ class PartnerPose(Given):
 
     No tube is certified for it: nothing is proven of how near that arm is to it, nor to the arm that follows the pose
     style, nor of how far it moves in a tick. The caller checks the distance between the arms.
+
+    Attributes:
+        position_mm: Of its tip, in the frame of the pose style.
+        jaw_rad: null where its jaw was not recorded.
     """
 
     arm: str
-    position_mm: Point = Field(description="Of its tip, in the frame of the pose style.")
+    position_mm: Point
     rotation_xyzw: Quaternion
-    jaw_rad: float | None = Field(description="null where its jaw was not recorded.")
+    jaw_rad: float | None
 
 
 class PartnerPath(Given):
@@ -30,39 +34,46 @@ class PartnerPath(Given):
 
     No tube is certified for it: the caller checks the distance between the arms. Its steps are not limited, and it is
     neither refused nor changed beside a scene.
+
+    Attributes:
+        position_mm: Of its tip, in the frame of the pose style.
+        jaw_rad: null where its jaw was not recorded.
+        scene: How near it comes to the scene that the version was learnt in, of which a part may be this arm itself;
+            negative or 0 where it touches.
     """
 
     arm: str
-    position_mm: list[Point] = Field(description="Of its tip, in the frame of the pose style.")
+    position_mm: list[Point]
     rotation_xyzw: list[Quaternion]
-    jaw_rad: list[float] | None = Field(description="null where its jaw was not recorded.")
-    scene: TubeClearance | None = Field(
-        default=None,
-        description="How near it comes to the scene that the version was learnt in, of which a part may be this arm "
-        "itself; negative or 0 where it touches.",
-    )
+    jaw_rad: list[float] | None
+    scene: TubeClearance | None = None
 
 
 class PoseAnswer(Given):
     """The next pose for a pose that was reached.
 
     Outside the tube the certificate proves nothing: a client stops there, or brings the hand back by other means.
+
+    Attributes:
+        phase: After this tick; to be sent with the pose that is reached then.
+        elapsed_s: Time of that phase from the start of the motion.
+        off_mm: Distance of the pose that was sent from that of its phase.
+        inside: Whether the pose that was sent lies in the tube.
+        finished: Whether the last pose was reached.
+        partner_pose: Where the other arm was demonstrated to be at `phase`; no tube is certified for it, so check the
+            distance between the arms. null where its motion was not learnt.
     """
 
     position_mm: Point
     rotation_xyzw: Quaternion
     jaw_rad: float | None
-    phase: Count = Field(description="After this tick; to be sent with the pose that is reached then.")
-    elapsed_s: float = Field(description="Time of that phase from the start of the motion.")
-    off_mm: float = Field(description="Distance of the pose that was sent from that of its phase.")
+    phase: Count
+    elapsed_s: float
+    off_mm: float
     off_rad: float
-    inside: bool = Field(description="Whether the pose that was sent lies in the tube.")
-    finished: bool = Field(description="Whether the last pose was reached.")
-    partner_pose: PartnerPose | None = Field(
-        default=None,
-        description="Where the other arm was demonstrated to be at `phase`; no tube is certified for it, so check the "
-        "distance between the arms. null where its motion was not learnt.",
-    )
+    inside: bool
+    finished: bool
+    partner_pose: PartnerPose | None = None
 
 
 class NextPose(PoseAnswer, PolicyName):
@@ -73,32 +84,43 @@ class NextPose(PoseAnswer, PolicyName):
 
 
 class SessionPose(PoseAnswer):
-    """The next pose of a session."""
+    """The next pose of a session.
 
-    newer_version: int | None = Field(description="Another version that was released since; the session keeps its own.")
+    Attributes:
+        newer_version: Another version that was released since; the session keeps its own.
+    """
+
+    newer_version: int | None
 
 
 class SessionLimits(Given):
-    """What a session allows; more closes it."""
+    """What a session allows; more closes it.
+
+    Attributes:
+        burst: Messages at once.
+        idle_s: Without a message for so long it is closed.
+    """
 
     rate_hz: float
-    burst: float = Field(description="Messages at once.")
+    burst: float
     message_bytes: int
-    idle_s: float = Field(description="Without a message for so long it is closed.")
+    idle_s: float
 
 
 class SessionOpening(PolicyName):
-    """The first message of a session: the version that it is pinned to, the tube, and the limits."""
+    """The first message of a session: the version that it is pinned to, the tube, and the limits.
+
+    Attributes:
+        tick_s: Time between two phases.
+        scene: The distance of the path from the scene that the version was learnt in; the tube is narrower.
+    """
 
     arm: str
     frame: str
     phases: int
-    tick_s: float = Field(description="Time between two phases.")
+    tick_s: float
     tube: TubeCertificate
-    scene: TubeClearance | None = Field(
-        default=None,
-        description="The distance of the path from the scene that the version was learnt in; the tube is narrower.",
-    )
+    scene: TubeClearance | None = None
     limits: SessionLimits
 
 
@@ -107,6 +129,17 @@ class PoseStyle(PolicyName):
 
     Phase k of N is the share k / (N - 1) of the time; the lists have an entry for each. The motion lies at the start
     and the goal pose of one demonstration. `tube` certifies the rule by which `POST .../next` follows it.
+
+    Attributes:
+        jaw_rad: null where a demonstration has no jaw.
+        spread_mm: Standard deviation of the demonstrations about the path.
+        turn_share: Where the orientations are between the shortest turn from start to goal, 0, and the mean of the
+            demonstrations, 1; below 1 they turn in unlike ways.
+        tick_s: Time between two phases.
+        scene: The distance of the path from the scene that the version was learnt in; the tube is narrower.
+        partner: The other arm as it took the needle, where that was recorded.
+        partner_motion: The other arm's motion at the same phases, where every demonstration's recording has it all
+            along; no tube is certified for it.
     """
 
     format: Literal["suture-skills pose style 1"]
@@ -117,27 +150,16 @@ class PoseStyle(PolicyName):
     demos: list[Sha256]
     position_mm: list[Point]
     rotation_xyzw: list[Quaternion]
-    jaw_rad: list[float] | None = Field(description="null where a demonstration has no jaw.")
+    jaw_rad: list[float] | None
     elapsed_s: list[float]
-    spread_mm: list[float] = Field(description="Standard deviation of the demonstrations about the path.")
+    spread_mm: list[float]
     spread_rad: list[float]
-    turn_share: float = Field(
-        default=1.0,
-        description="Where the orientations are between the shortest turn from start to goal, 0, and the mean of the "
-        "demonstrations, 1; below 1 they turn in unlike ways.",
-    )
-    tick_s: float = Field(description="Time between two phases.")
+    turn_share: float = 1.0
+    tick_s: float
     tube: TubeCertificate
-    scene: TubeClearance | None = Field(
-        default=None,
-        description="The distance of the path from the scene that the version was learnt in; the tube is narrower.",
-    )
-    partner: Partner | None = Field(description="The other arm as it took the needle, where that was recorded.")
-    partner_motion: PartnerPath | None = Field(
-        default=None,
-        description="The other arm's motion at the same phases, where every demonstration's recording has it all "
-        "along; no tube is certified for it.",
-    )
+    scene: TubeClearance | None = None
+    partner: Partner | None
+    partner_motion: PartnerPath | None = None
     created_at: datetime
 
 
@@ -153,7 +175,7 @@ class NextIn(Schema):
     )
 
     position_mm: PointIn
-    rotation_xyzw: tuple[Component, Component, Component, Component] | None = None
+    rotation_xyzw: QuaternionIn | None = None
     phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None
 
 
@@ -161,5 +183,5 @@ class PoseIn(Schema):
     """A message of a session: a pose that was reached, and its phase; null: that of the answer before."""
 
     position_mm: PointIn
-    rotation_xyzw: tuple[Component, Component, Component, Component]
+    rotation_xyzw: QuaternionIn
     phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None

@@ -157,7 +157,14 @@ class LeftOut:
 
 
 class ContentLists(Given):
-    """The parts of a raw file, and the proposed hand-offs."""
+    """The parts of a raw file, and the proposed hand-offs.
+
+    Attributes:
+        tools: The instrument of each arm, where the file names it.
+        dropped: Topics with samples whose stamps went back.
+        setpoints: Commanded poses and jaws; nothing is learnt from them.
+        identifications: Arms identified from joints recorded beside poses.
+    """
 
     notes: dict[str, str]
     topics: list[Topic]
@@ -165,17 +172,17 @@ class ContentLists(Given):
     segments: list[Segment]
     counts: RecordingCounts
     labels: list[Label]
-    tools: dict[str, str] = Field(description="The instrument of each arm, where the file names it.")
+    tools: dict[str, str]
     joints: list[JointStates]
     masters: list[Master]
     pedals: list[Pedal]
     following: list[Following]
     scales: list[Scale]
     left_out: list[LeftOut]
-    dropped: list[Dropped] = Field(description="Topics with samples whose stamps went back.")
-    setpoints: list[Setpoints] = Field(description="Commanded poses and jaws; nothing is learnt from them.")
+    dropped: list[Dropped]
+    setpoints: list[Setpoints]
     base_frames: list[BaseFrame]
-    identifications: list[ArmIdentification] = Field(description="Arms identified from joints recorded beside poses.")
+    identifications: list[ArmIdentification]
 
 
 class RecordingContent(ContentLists):
@@ -186,13 +193,17 @@ class RecordingContent(ContentLists):
 
 
 class Described(Given):
-    """The content of a raw file with its identity, and the proposed hand-offs."""
+    """The content of a raw file with its identity, and the proposed hand-offs.
+
+    Attributes:
+        integrity: The part of it that checksums cover.
+    """
 
     sha256: Sha256
     size_bytes: Count
     media_type: str
     format: str = Field(description=f"One of {', '.join(get_args(Format))}.")
-    integrity: Literal["full", "partial", "none"] = Field(description="The part of it that checksums cover.")
+    integrity: Literal["full", "partial", "none"]
 
 
 class Recording(Described, RecordingContent):
@@ -203,7 +214,12 @@ class Recording(Described, RecordingContent):
 
 
 class RecordingSummary(Given):
-    """A recording in a list."""
+    """A recording in a list.
+
+    Attributes:
+        segments: Number of proposed hand-offs.
+        demos: Number of active demonstrations cut out of it.
+    """
 
     id: Sha256
     sha256: Sha256
@@ -211,18 +227,23 @@ class RecordingSummary(Given):
     format: str
     duration_s: float
     arms: list[str]
-    segments: Count = Field(description="Number of proposed hand-offs.")
-    demos: Count = Field(description="Number of active demonstrations cut out of it.")
+    segments: Count
+    demos: Count
     created_at: datetime
 
 
 class RecordingPreview(Described, ContentLists):
-    """The content of a raw file as it would be read; nothing of it is stored."""
+    """The content of a raw file as it would be read; nothing of it is stored.
 
-    timed: bool = Field(description="Whether the samples have times; a table without them is stored only with a rate.")
+    Attributes:
+        timed: Whether the samples have times; a table without them is stored only with a rate.
+        columns: The columns of a table, used or not; empty of any other file.
+    """
+
+    timed: bool
     duration_s: float | None
     quality: list[PreviewedQuality]
-    columns: list[Column] = Field(description="The columns of a table, used or not; empty of any other file.")
+    columns: list[Column]
 
 
 @schema
@@ -249,38 +270,38 @@ class SuturePoint:
 
 
 class SuturePoints(Given):
-    """The marks of a scene, in the order of their numbers, entries before exits."""
+    """The marks of a scene, in the order of their numbers, entries before exits.
 
-    arm: str | None = Field(description="null where a frame was named that is no arm's.")
+    Attributes:
+        arm: null where a frame was named that is no arm's.
+    """
+
+    arm: str | None
     frame: str
     points: tuple[SuturePoint, ...]
 
 
 class TableIn(Schema):
-    """Statements about a recording that it does not make itself, most of them about a table (docs/tables.md)."""
+    """Statements about a recording that it does not make itself, most of them about a table (docs/tables.md).
 
-    rate_hz: Annotated[float, Field(gt=0, le=10_000)] | None = Field(
-        default=None, description="Samples per second, of a table without times."
-    )
-    frame: Annotated[str, Field(pattern=FRAME)] | None = Field(
-        default=None,
-        description="The frame of the poses in a table or a LeRobot dataset; base, the default for a table of one arm: "
-        "the arm's base.",
-    )
-    column: Annotated[list[Annotated[str, Field(max_length=200, pattern=LINE)]], Field(max_length=30)] | None = Field(
-        default=None,
-        description="A column under another name, of a table as x_mm=NAME, or as x=NAME with a unit (docs/tables.md).",
-    )
-    unit: Annotated[list[Literal["m", "mm", "rad", "deg", "s", "ms", "us", "ns"]], Field(max_length=3)] | None = Field(
-        default=None, description="The unit of columns that name none, of lengths, angles or times."
-    )
-    decimal: Literal["point", "comma"] | None = Field(default=None, description="The decimal mark; point by default.")
-    table_arm: Annotated[str, Field(pattern=ARM)] | None = Field(
-        default=None, description="The arm of a table; PSM by default."
-    )
-    instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = Field(
-        default=None, description="The instrument with which a table's joints become poses."
-    )
+    Attributes:
+        rate_hz: Samples per second, of a table without times.
+        frame: The frame of the poses in a table or a LeRobot dataset; base, the default for a table of one arm: the
+            arm's base.
+        column: A column under another name, of a table as x_mm=NAME, or as x=NAME with a unit (docs/tables.md).
+        unit: The unit of columns that name none, of lengths, angles or times.
+        decimal: The decimal mark; point by default.
+        table_arm: The arm of a table; PSM by default.
+        instrument: The instrument with which a table's joints become poses.
+    """
+
+    rate_hz: Annotated[float, Field(gt=0, le=10_000)] | None = None
+    frame: Annotated[str, Field(pattern=FRAME)] | None = None
+    column: Annotated[list[Annotated[str, Field(max_length=200, pattern=LINE)]], Field(max_length=30)] | None = None
+    unit: Annotated[list[Literal["m", "mm", "rad", "deg", "s", "ms", "us", "ns"]], Field(max_length=3)] | None = None
+    decimal: Literal["point", "comma"] | None = None
+    table_arm: Annotated[str, Field(pattern=ARM)] | None = None
+    instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = None
 
     @property
     def options(self) -> dict[str, Any]:  # keyword arguments

@@ -5,7 +5,9 @@ Unknown fields, NaN and infinity are refused. Every pattern has a description in
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, StrictInt
+from pydantic import ConfigDict, Field, StrictInt
+
+from skills.fields import Documented
 
 SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 DIGEST = r"^[0-9a-f]{8,64}$"  # in full, or a prefix that no other digest has
@@ -18,7 +20,7 @@ LINE = r"^[^\x00-\x1f\x7f]+$"
 LINES = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"
 COUNT = r"^\d{0,4}$"
 
-_IN_WORDS = {
+_DESCRIBED = {
     SLUG: "must be 1 to 64 lower-case letters, digits, - and _, and begin with a letter or a digit",
     DIGEST: "must be a digest: 64 of the characters 0-9 and a-f, or at least the first 8 of them",
     JOB: "must be a job's id: 16 of the characters 0-9 and a-f",
@@ -32,12 +34,12 @@ _IN_WORDS = {
 }
 
 
-def in_words(pattern: str) -> str:
+def describe(pattern: str) -> str:
     """Return the description of a pattern in words; every pattern of a request has one."""
-    return _IN_WORDS[pattern]
+    return _DESCRIBED[pattern]
 
 
-class Schema(BaseModel):
+class Schema(Documented):
     """The base class of request bodies: immutable; unknown fields, NaN and infinity are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
@@ -54,6 +56,7 @@ Source = Annotated[str, Field(min_length=1, max_length=600, pattern=LINE)]
 Coordinate = Annotated[Number, Field(ge=-10_000, le=10_000)]
 PointIn = tuple[Coordinate, Coordinate, Coordinate]
 Component = Annotated[Number, Field(ge=-1e6, le=1e6)]
+QuaternionIn = tuple[Component, Component, Component, Component]
 
 
 def shown(*examples: dict[str, Any]) -> ConfigDict:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StrictBool, StrictInt
 
-from skills.comparison.combining import COMBININGS, Combining
+from skills.comparison.combining import Combining
 from skills.fields import Count, Fraction, Sha256, Slug, schema
 from skills.gridworld.hazards import SceneCosts, Surroundings
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
@@ -29,13 +29,28 @@ LearnerIn: Any = Annotated[reduce(or_, map(_learner, LEARNERS.values())), Field(
 class CombineIn(Schema):
     """The way several demonstrations are combined into one path (docs/combining.md)."""
 
-    kind: Literal["medoid", "barycentre", "corridor"]
+    kind: Combining
 
 
 class TrainingIn(Schema):
     """A training. Defaults: the newest active demonstration, the phase learner, seed 0, no release.
 
     Several demonstrations are combined: as a corridor, if `combine` is left out.
+
+    Attributes:
+        demos: The demonstrations to learn from; by default the newest one that is active and not marked recovery or
+            failure.
+        learner: Its kind and settings; by default Q-learning in the phase state.
+        seed: Seed of the random numbers; the phase learner's result is independent of it.
+        release: Release the version if it passes the gate; also if an equal training is done already and its version is
+            not the one that the style serves now.
+        outcomes: success refuses demonstrations that are marked recovery or failure; any learns from them too.
+        depth_along: Direction in which depth increases, of a demonstration whose frame is not the base of its arm: of
+            equally short ways the policy takes the shallower one. In a base frame depth is the distance from the
+            origin.
+        scene: What must not be touched; phase-q-learning and value-iteration learn in it, with their `slip`. Use a
+            gamma near 1, such as 0.95.
+        scene_costs: Costs of the scene, in addition to the rewards of Algorithm 1.
     """
 
     model_config = shown(
@@ -45,40 +60,15 @@ class TrainingIn(Schema):
 
     surgeon: SlugField
     suture: SlugField
-    demos: list[DigestField] | None = Field(
-        default=None,
-        description="The demonstrations to learn from; by default the newest one that is active and not marked "
-        "recovery or failure.",
-    )
+    demos: list[DigestField] | None = None
     combine: CombineIn | None = None
-    learner: LearnerIn | None = Field(
-        default=None, description="Its kind and settings; by default Q-learning in the phase state."
-    )
-    seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = Field(
-        default=0, description="Seed of the random numbers; the phase learner's result is independent of it."
-    )
-    release: StrictBool = Field(
-        default=False,
-        description="Release the version if it passes the gate; also if an equal training is done already and its "
-        "version is not the one that the style serves now.",
-    )
-    outcomes: Literal["success", "any"] = Field(
-        default="success",
-        description="success refuses demonstrations that are marked recovery or failure; any learns from them too.",
-    )
-    depth_along: PointIn | None = Field(
-        default=None,
-        description="Direction in which depth increases, of a demonstration whose frame is not the base of its arm: of "
-        "equally short ways the policy takes the shallower one. In a base frame depth is the distance from the origin.",
-    )
-    scene: SceneIn | None = Field(
-        default=None,
-        description="What must not be touched; phase-q-learning and value-iteration learn in it, with their `slip`. "
-        "Use a gamma near 1, such as 0.95.",
-    )
-    scene_costs: SceneCostsIn | None = Field(
-        default=None, description="Costs of the scene, in addition to the rewards of Algorithm 1."
-    )
+    learner: LearnerIn | None = None
+    seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = 0
+    release: StrictBool = False
+    outcomes: Literal["success", "any"] = "success"
+    depth_along: PointIn | None = None
+    scene: SceneIn | None = None
+    scene_costs: SceneCostsIn | None = None
 
     @property
     def chosen(self) -> Learner | None:
@@ -96,27 +86,28 @@ class TrainingIn(Schema):
     @property
     def combining(self) -> Combining | None:
         """The way of combining as a value of the domain."""
-        return None if self.combine is None else COMBININGS[self.combine.kind]()
+        return None if self.combine is None else self.combine.kind
 
 
 class RetrainingIn(Schema):
-    """A batch of trainings. Defaults: all styles, the phase learner, no release."""
+    """A batch of trainings. Defaults: all styles, the phase learner, no release.
+
+    Attributes:
+        surgeon: Only of this surgeon.
+        suture: Only of this suture type.
+        only_stale: Leaves out every style whose newest version is what this would make of it: learnt from its newest
+            demonstration, with these settings, by this version of the learner, under this gate's limits.
+        learner: Its kind and settings; by default Q-learning in the phase state.
+        release: Releases a version that passes the gate and is not worse than the released one.
+    """
 
     model_config = shown({}, {"surgeon": "kestrel", "only_stale": True, "release": True})
 
-    surgeon: SlugField | None = Field(default=None, description="Only of this surgeon.")
-    suture: SlugField | None = Field(default=None, description="Only of this suture type.")
-    only_stale: StrictBool = Field(
-        default=False,
-        description="Leaves out every style whose newest version is what this would make of it: learnt from its newest "
-        "demonstration, with these settings, by this version of the learner, under this gate's limits.",
-    )
-    learner: LearnerIn | None = Field(
-        default=None, description="Its kind and settings; by default Q-learning in the phase state."
-    )
-    release: StrictBool = Field(
-        default=False, description="Releases a version that passes the gate and is not worse than the released one."
-    )
+    surgeon: SlugField | None = None
+    suture: SlugField | None = None
+    only_stale: StrictBool = False
+    learner: LearnerIn | None = None
+    release: StrictBool = False
 
     @property
     def chosen(self) -> Learner | None:
@@ -200,24 +191,38 @@ class StyleComparison(StoredComparison):
 
 
 class TrainingResult(JobResult):
-    """The result of a training's job, as it is stored: its version, and the effect on what the style serves."""
+    """The result of a training's job, as it is stored: its version, and the effect on what the style serves.
+
+    Attributes:
+        released: Whether the version is what the style serves now.
+        not_released_because: Why a requested release is not in force.
+        remedy: What to do about it.
+    """
 
     policy_version: VersionNumber
     sha256: Sha256
     releasable: bool
-    released: bool = Field(description="Whether the version is what the style serves now.")
-    not_released_because: str | None = Field(description="Why a requested release is not in force.")
-    remedy: str | None = Field(description="What to do about it.")
+    released: bool
+    not_released_because: str | None
+    remedy: str | None
 
 
 class ServedTraining(TrainingResult):
-    """The result of a training's job now."""
+    """The result of a training's job now.
 
-    was_released: bool = Field(description="Whether the job released it.")
+    Attributes:
+        was_released: Whether the job released it.
+    """
+
+    was_released: bool
 
 
 class RetrainedStyle(Given):
-    """The result of one style of a batch."""
+    """The result of one style of a batch.
+
+    Attributes:
+        served: What the style serves now; null: nothing.
+    """
 
     surgeon: Slug
     suture: Slug
@@ -228,7 +233,7 @@ class RetrainedStyle(Given):
     policy_version: int | None
     sha256: Sha256 | None
     comparison: StyleComparison | None
-    served: ServedNow | None = Field(default=None, description="What the style serves now; null: nothing.")
+    served: ServedNow | None = None
     ended_at: datetime | None
 
 

@@ -24,6 +24,17 @@ class TryIn(Schema):
 
     A question without an answer ends the job with the choices; sent again with one of them, the try goes on, and what
     is stored already is used again.
+
+    Attributes:
+        segment: A proposed hand-off, counted from 1, or the whole recording; asked if there are several.
+        loss_mm: The coarsest cells of at most 5 mm are taken that lose at most this much: RMSE between samples and the
+            centres of their cells, 3-D.
+        cell_mm: Length of a cell's edge, in place of the measured choice.
+        hysteresis: Hysteresis in cells, in place of the measured choice: 0.25 if the path trembles, else 0.
+        release: Release the version if it passes the gate; asked.
+        tissue_mm: Height of level tissue in the arm's frame, or none if it is not known; asked.
+        errors: Errors of the arms that are to play it; asked.
+        psm_m: The arm that takes the needle; if neither this nor the recording has it, there is no hand-off.
     """
 
     model_config = shown(
@@ -37,33 +48,14 @@ class TryIn(Schema):
     recording: DigestField
     surgeon: SlugField
     suture: SlugField
-    segment: Literal["whole"] | Annotated[int, Field(ge=1, le=1_000_000)] | None = Field(
-        default=None,
-        description="A proposed hand-off, counted from 1, or the whole recording; asked if there are several.",
-    )
-    loss_mm: Annotated[float, Field(gt=0, le=50)] = Field(
-        default=LOSS_MM,
-        description="The coarsest cells of at most 5 mm are taken that lose at most this much: RMSE between samples "
-        "and the centres of their cells, 3-D.",
-    )
-    cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = Field(
-        default=None, description="Length of a cell's edge, in place of the measured choice."
-    )
-    hysteresis: Annotated[float, Field(ge=0, le=MAX_HYSTERESIS)] | None = Field(
-        default=None,
-        description="Hysteresis in cells, in place of the measured choice: 0.25 if the path trembles, else 0.",
-    )
-    release: StrictBool | None = Field(default=None, description="Release the version if it passes the gate; asked.")
-    tissue_mm: Literal["none"] | Coordinate | None = Field(
-        default=None, description="Height of level tissue in the arm's frame, or none if it is not known; asked."
-    )
-    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = Field(
-        default=None, description="Errors of the arms that are to play it; asked."
-    )
-    psm_m: PsmMIn | None = Field(
-        default=None,
-        description="The arm that takes the needle; if neither this nor the recording has it, there is no hand-off.",
-    )
+    segment: Literal["whole"] | Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    loss_mm: Annotated[float, Field(gt=0, le=50)] = LOSS_MM
+    cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = None
+    hysteresis: Annotated[float, Field(ge=0, le=MAX_HYSTERESIS)] | None = None
+    release: StrictBool | None = None
+    tissue_mm: Literal["none"] | Coordinate | None = None
+    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = None
+    psm_m: PsmMIn | None = None
 
     @property
     def arm_errors(self) -> ArmErrors | None:
@@ -90,6 +82,9 @@ class TryStep(Given):
 
     A step that `asks` has the choices, and ends the try unless another asks too; one that is `refused` has the reason,
     its remedies as in a problem document, and the choices that are worth a try.
+
+    Attributes:
+        id: The digest of what the step stored: demonstration, version, plan.
     """
 
     name: StepName
@@ -97,6 +92,4 @@ class TryStep(Given):
     text: str
     choices: tuple[Choice, ...] = ()
     remedies: tuple[str | dict[str, Any], ...] = ()
-    id: str | None = Field(
-        default=None, description="The digest of what the step stored: demonstration, version, plan."
-    )
+    id: str | None = None

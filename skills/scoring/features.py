@@ -93,12 +93,12 @@ def compare(measured: Numbers, reference: Numbers) -> tuple[ScoreFigure, ...]:
         measured: The motion's, as `measure` returns them.
         reference: The reference's.
     """
-    return tuple(_compare(kind, measured[kind.name], reference[kind.name]) for kind in KINDS)
-
-
-def _compare(kind: FigureKind, value: float | None, reference: float | None) -> ScoreFigure:
-    ratio = value / reference if value is not None and reference else None
-    return ScoreFigure(**vars(kind), value=value, reference=reference, ratio=ratio)
+    figures = []
+    for kind in KINDS:
+        value, other = measured[kind.name], reference[kind.name]
+        ratio = value / other if value is not None and other else None
+        figures.append(ScoreFigure(**vars(kind), value=value, reference=other, ratio=ratio))
+    return tuple(figures)
 
 
 LEAST_S = 3.0  # each third is then longer than the smoothing window

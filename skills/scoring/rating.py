@@ -17,7 +17,7 @@ from skills.arrays import Floats
 from skills.errors import BadInput
 from skills.fields import Fraction, Sha256, schema
 from skills.scoring.calibration import LEAST_RATING, LEVELS, MOST_RATING, PARTS, SkillModel
-from skills.scoring.features import SIDES, TRIAL_KIND_OF, FigureKind, TrialFigures, TrialKind
+from skills.scoring.features import SIDES, TRIAL_KIND_OF, FigureKind, TrialFigures
 from skills.scoring.validation import TaskValidation, known_parts, level_refusals
 
 NAMED = 3  # terms in the sentence
@@ -197,9 +197,5 @@ def _outside(model: SkillModel, task: int, values: Floats) -> Iterator[str]:
         if not low <= value <= high:
             kind = TRIAL_KIND_OF[name]
             unit = f" {kind.unit}" if kind.unit else ""
-            found, least, most = (_rounded(kind, one) for one in (value, low, high))
+            found, least, most = (f"{kind.readable(float(one)):.3g}" for one in (value, low, high))
             yield f"{kind.label} is {found}{unit}; the calibration data has {least} to {most}{unit}."
-
-
-def _rounded(kind: TrialKind, modelled: float) -> str:
-    return f"{kind.readable(float(modelled)):.3g}"

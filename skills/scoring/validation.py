@@ -15,14 +15,12 @@ better one of each draw counts.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from skills.arithmetic import wilson
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput
-from skills.fields import parse_json
 from skills.scoring.calibration import (
     PARTS,
     Cohort,
@@ -116,15 +114,6 @@ class TaskValidation:
     over_duration: tuple[float, float]
 
 
-def parse_task(stored: Mapping[str, Any]) -> TaskValidation:
-    """Return the validation of a task from the JSON that is stored with a model.
-
-    Args:
-        stored: The validation as plain JSON, field by field.
-    """
-    return parse_json(TaskValidation, stored)
-
-
 @dataclass(frozen=True)
 class Validation:
     """A model judged on surgeons left out.
@@ -162,7 +151,7 @@ def validate(
     found = held_out(cohort)
     series, levels = _predictions(cohort, found)
     rhos, drawn = _rhos(cohort, series, np.random.default_rng(seed))
-    permuted = _permuted(cohort, np.random.default_rng([seed, 1]), permutations, progress)
+    permuted_rhos, permuted_rights = _permuted(cohort, np.random.default_rng([seed, 1]), permutations, progress)
 
     def judged(rhos: Floats, drawn: Floats, rows: Ints | None = None) -> dict[str, Judged]:
         found = {name: _judged(*of_one) for name, *of_one in zip(series, rhos, drawn, strict=True)}
@@ -177,18 +166,18 @@ def validate(
 
     tasks = {}
     for task, (name, rows) in enumerate(zip(cohort.names, cohort.by_task, strict=True)):
-        of_task, rights = judged(rhos[task], drawn[task], rows), permuted.rights[task]
+        of_task, rights = judged(rhos[task], drawn[task], rows), permuted_rights[task]
         chance = Chance(
             permutations,
-            rho=float(permuted.rhos[task].mean()),
-            rho_p=_p(permuted.rhos.max(axis=0), of_task["model"].rho),
+            rho=float(permuted_rhos[task].mean()),
+            rho_p=_p(permuted_rhos.max(axis=0), of_task["model"].rho),
             accuracy=float(rights.mean()),
-            accuracy_p=_p(permuted.rights.max(axis=0), of_task["model"].accuracy or 0.0),
+            accuracy_p=_p(permuted_rights.max(axis=0), of_task["model"].accuracy or 0.0),
             commonest=float(np.bincount(cohort.levels[rows]).max() / len(rows)),
         )
         surgeons = len(np.unique(cohort.surgeons[rows]))
         tasks[name] = _validation(len(rows), surgeons, of_task, chance, dict(zip(series, drawn[task], strict=True)))
-    mean, by_chance = judged(rhos.mean(axis=0), drawn.mean(axis=0)), permuted.rhos.mean(axis=0)
+    mean, by_chance = judged(rhos.mean(axis=0), drawn.mean(axis=0)), permuted_rhos.mean(axis=0)
     overall = _validation(
         len(cohort.tasks),
         len(np.unique(cohort.surgeons)),
@@ -291,17 +280,10 @@ def _p(permuted: Floats, ours: float) -> float:
     return float(1 + (permuted >= ours).sum()) / (1 + len(permuted))
 
 
-@dataclass(frozen=True, eq=False)
-class _Permuted:
-    """The quality of predictions of permuted ratings for surgeons left out: rank correlations and shares, (T, K)."""
-
-    rhos: Floats
-    rights: Floats
-
-
 def _permuted(
     cohort: Cohort, rng: np.random.Generator, permutations: int, progress: Callable[[float], None]
-) -> _Permuted:
+) -> tuple[Floats, Floats]:
+    """Predict permuted ratings for surgeons left out; return rank correlations and shares of right levels, (T, K)."""
     orders = np.stack([shuffled(cohort, rng) for _ in range(permutations)], axis=1)
     rhos, rights = (np.empty((len(cohort.names), permutations)) for _ in range(2))
     for first, last in pairwise([*range(0, permutations, PERMUTED_AT_ONCE), permutations]):
@@ -311,7 +293,7 @@ def _permuted(
             rhos[task, first:last] = rank_correlations(held.scores[rows, 0].T[None], ratings[rows].T)[0]
             rights[task, first:last] = (held.levels[rows] == levels[rows]).mean(axis=0)
         progress(last / permutations)
-    return _Permuted(rhos, rights)
+    return rhos, rights
 
 
 def shuffled(cohort: Cohort, rng: np.random.Generator) -> Ints:

@@ -104,7 +104,6 @@ def make_film(
     *,
     pad_top_mm: float,
     samples: ArrayLike | None = None,
-    timeout_s: float = FILM_TIMEOUT_S,
     memory_bytes: int = 1 << 30,
     target: str = FILM_MAKER,
 ) -> Film:
@@ -114,7 +113,6 @@ def make_film(
         trajectory: The trajectory to film.
         pad_top_mm: Height of the suture pad's top in the PSM base frame.
         samples: The sample that each frame shows, in order; by default `frames_of` chooses.
-        timeout_s: Wall time after which the process is killed.
         memory_bytes: Memory limit of the process, and the same again for the encoder.
         target: The function that makes the film, as `module:function`.
 
@@ -124,7 +122,7 @@ def make_film(
     if target == FILM_MAKER:
         simulator.require_pybullet()
     at = frames_of(trajectory) if samples is None else np.asarray(samples, np.int64)
-    limits = ProcessLimits(memory_bytes, timeout_s, program=_encoder())
+    limits = ProcessLimits(memory_bytes, FILM_TIMEOUT_S, program=_encoder())
     return simulated(target, FilmRequest(trajectory, pad_top_mm, at), Film, CLASSES, limits)
 
 
@@ -186,9 +184,7 @@ def _frames(scene: simulator.Simulator, asked: FilmRequest) -> Iterator[bytes]:
     turns = quaternion_of(rotation)
     frame = b""
     for k, sample in enumerate(asked.samples.tolist()):
-        scene.pose(motion.joints[sample])
-        if scene.psm_m is not None and motion.psm_m is not None:
-            scene.pose(motion.psm_m.joints[sample], scene.psm_m)
+        scene.show(motion, sample)
         sheet = pictures.Sheet(scene.photograph(camera, (place_mm[k], turns[k])), camera)
         _draw_path(sheet, asked, sample)
         frame = _framed(sheet.finished(), motion, sample).tobytes()

@@ -353,9 +353,6 @@ def _between_axes(one: tuple[Floats, Floats, float], other: tuple[Floats, Floats
 
 def png(figure: "Figure") -> bytes:
     """Return a figure as a PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
     out = io.BytesIO()
     figure.savefig(out, dpi=DPI, format="png", metadata={"Software": None})
     return out.getvalue()
@@ -397,7 +394,7 @@ def _finished(figure: "Figure", title: str, trajectory: Trajectory, report: Repo
     shown |= {PHASES[phase]: Patch(color=shade) for phase, shade in SHADES.items()}
     columns = ceil(len(shown) / ceil(len(shown) / _ABREAST))
     figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
-    verdict = report["failure_in_words"] or "Feasible in an exact simulation."
+    verdict = report["failure_sentence"] or "Feasible in an exact simulation."
     figure.suptitle(f"{title}\n{verdict}", fontsize=11, x=0.01, ha="left", linespacing=1.5)
     figure.text(0.995, 0.99, "research use only", ha="right", va="top", fontsize=8, color=_FAINT)
     return figure

@@ -26,7 +26,6 @@ from importlib.metadata import version
 from importlib.resources import as_file, files
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -41,7 +40,7 @@ from skills.planning.motion_laws import A1, Poses
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
 from skills.simulation import pictures
 from skills.verification.clearance import Bounds
-from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, Playback, link_pairs, pad_scale
+from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, PAD, Playback, link_pairs, pad_scale
 
 MM = 1e-3
 PLACE, TURN = 4, 5  # indices of the frame in a link's state; 0 and 1 would be its centre of mass
@@ -105,15 +104,16 @@ def opened(instrument: str, rate_hz: float) -> Iterator["Simulator"]:
     """Open a fresh scene with PSM_A, and close it at the end; a fresh one gives the same numbers each time."""
     require_pybullet()
     import pybullet
+    from pybullet_utils.bullet_client import BulletClient
 
-    client = pybullet.connect(pybullet.DIRECT)
+    bullet = BulletClient(pybullet.DIRECT)
     try:
-        pybullet.setTimeStep(1.0 / rate_hz, physicsClientId=client)
-        pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-        pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        yield Simulator(pybullet, client, instrument_of(instrument))
+        bullet.setTimeStep(1.0 / rate_hz)
+        bullet.setGravity(0, 0, -9.81)
+        bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
+        yield Simulator(bullet, instrument_of(instrument))
     finally:
-        pybullet.disconnect(physicsClientId=client)
+        bullet.disconnect()
 
 
 @dataclass(frozen=True)
@@ -131,10 +131,8 @@ class SceneBody:
 class Simulator:
     """One simulation. Lengths in arguments are in mm, except in `drive` and in cameras, which use PyBullet's metres."""
 
-    def __init__(self, bullet: ModuleType, client: int, tool: InstrumentConstants) -> None:
-        self.bullet: Any = bullet
-        self.client = client
-        self.tool = tool
+    def __init__(self, bullet: Any, tool: InstrumentConstants) -> None:
+        self.bullet = bullet
         self.files: dict[str, str] = {}
         self.arm = self._load_arm(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), tool, HOLDING_RAD)
         self.pad: int | None = None
@@ -151,7 +149,7 @@ class Simulator:
         """Place the pad under a trajectory, and PSM_M if it has one."""
         self.place_pad(trajectory.tip_mm, pad_top_mm)
         if (m := trajectory.psm_m) is not None:
-            self.place_psm_m(m.base_mm, m.base_xyzw, m.instrument)
+            self.place_psm_m(m.base_mm, m.base_xyzw, instrument_of(m.instrument))
 
     def place_pad(self, tip_mm: Floats, top_mm: float) -> None:
         """Lay the pad, large enough, under the middle of the path, with its wound along the path's longer side."""
@@ -162,28 +160,29 @@ class Simulator:
         self.pad_mm = np.array([middle[0], middle[1], top_mm])
         self.pad = self._load("suture_pad.urdf", self.pad_mm, quaternion, scale=pad_scale(tip_mm))
 
-    def place_psm_m(self, base_mm: Floats, base_xyzw: Floats, instrument: str | None = None) -> None:
-        """Load PSM_M, in green and with its jaws open, by default with PSM_A's instrument.
+    def place_psm_m(self, base_mm: Floats, base_xyzw: Floats, tool: InstrumentConstants) -> None:
+        """Load PSM_M, in green and with its jaws open.
 
         Collisions between the arms are off, because their distance is measured instead.
         """
-        tool = instrument_of(instrument) if instrument else self.tool
         self.psm_m = self._load_arm(base_mm, base_xyzw, tool, OPEN_RAD)
-        links = range(-1, self.bullet.getNumJoints(self.psm_m.number, physicsClientId=self.client))
+        links = range(-1, self.bullet.getNumJoints(self.psm_m.number))
         for link in links:
             for own in links:
-                self.bullet.setCollisionFilterPair(
-                    self.arm.number, self.psm_m.number, own, link, 0, physicsClientId=self.client
-                )
-            self.bullet.changeVisualShape(self.psm_m.number, link, rgbaColor=PSM_M_COLOUR, physicsClientId=self.client)
+                self.bullet.setCollisionFilterPair(self.arm.number, self.psm_m.number, own, link, 0)
+            self.bullet.changeVisualShape(self.psm_m.number, link, rgbaColor=PSM_M_COLOUR)
 
     def pose(self, joints: Floats, body: SceneBody | None = None) -> None:
         """Set an arm's joints (rad, insertion mm) exactly, at rest."""
         arm = body or self.arm
         # One call for all joints takes a fifth of the time of one call for each.
-        self.bullet.resetJointStatesMultiDof(
-            arm.number, arm.joints, in_metres(joints)[:, None].tolist(), physicsClientId=self.client
-        )
+        self.bullet.resetJointStatesMultiDof(arm.number, arm.joints, in_metres(joints)[:, None].tolist())
+
+    def show(self, trajectory: Trajectory, sample: int) -> None:
+        """Set the joints of the arms in the scene to those of a sample."""
+        self.pose(trajectory.joints[sample])
+        if self.psm_m is not None and trajectory.psm_m is not None:
+            self.pose(trajectory.psm_m.joints[sample], self.psm_m)
 
     # -- measurements and motion --
 
@@ -195,7 +194,7 @@ class Simulator:
 
     def joint_states(self) -> Any:
         """Return PSM_A's joint states in PyBullet's form: position, speed, reaction, effort of each."""
-        return self.bullet.getJointStates(self.arm.number, self.arm.joints, physicsClientId=self.client)
+        return self.bullet.getJointStates(self.arm.number, self.arm.joints)
 
     def read_tip(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return PSM_A's tool frame: position in mm and quaternion."""
@@ -204,16 +203,16 @@ class Simulator:
 
     def frame_of(self, body: SceneBody, link: int) -> Any:
         """Return the frame of a link in PyBullet's form: position in m and quaternion."""
-        state = self.bullet.getLinkState(body.number, link, 0, 1, self.client)
+        state = self.bullet.getLinkState(body.number, link, 0, 1)
         return state[PLACE], state[TURN]
 
     def closest(self, body: int, other: int) -> Any:
         """Return the nearest points of all links of two bodies that are near each other, in PyBullet's form."""
-        return self.bullet.getClosestPoints(body, other, CLEARANCE_SEEN_MM * MM, physicsClientId=self.client)
+        return self.bullet.getClosestPoints(body, other, CLEARANCE_SEEN_MM * MM)
 
     def pressed_n(self) -> float:
         """Return the force of the pad on PSM_A, N."""
-        points = self.bullet.getContactPoints(self.arm.number, self.pad, physicsClientId=self.client)
+        points = self.bullet.getContactPoints(self.arm.number, self.pad)
         return float(sum(point[9] for point in points))
 
     def drive(self, start: list[float], velocity: list[float]) -> None:
@@ -232,9 +231,8 @@ class Simulator:
             forces=self._efforts,
             positionGains=self._position_gains,
             velocityGains=self._velocity_gains,
-            physicsClientId=self.client,
         )
-        self.bullet.stepSimulation(physicsClientId=self.client)
+        self.bullet.stepSimulation()
 
     def photograph(self, camera: pictures.Camera, needle: tuple[Floats, Floats] | None = None) -> pictures.Photograph:
         """Return an image of the present scene, the needle in a given pose (mm, quaternion) or between PSM_A's jaws."""
@@ -252,7 +250,6 @@ class Simulator:
             projection,
             lightDirection=(0.3, 0.5, 1.0),
             renderer=self.bullet.ER_TINY_RENDERER,
-            physicsClientId=self.client,
         )
         size = (camera.height, camera.width)
         return pictures.Photograph(
@@ -270,9 +267,7 @@ class Simulator:
     def _place_needle(self, place_mm: Floats, quaternion: Floats) -> None:
         if self.needle is None:
             self.needle = self._load("needle.urdf", np.zeros(3), [0.0, 0.0, 0.0, 1.0])
-        self.bullet.resetBasePositionAndOrientation(
-            self.needle, (place_mm * MM).tolist(), quaternion.tolist(), physicsClientId=self.client
-        )
+        self.bullet.resetBasePositionAndOrientation(self.needle, (place_mm * MM).tolist(), quaternion.tolist())
 
     # -- loading --
 
@@ -295,7 +290,6 @@ class Simulator:
                     globalScaling=scale,
                     # Without it PyBullet makes cylinders into hulls, a millimetre too thick.
                     flags=self.bullet.URDF_USE_IMPLICIT_CYLINDER,
-                    physicsClientId=self.client,
                 )
             )
 
@@ -303,10 +297,7 @@ class Simulator:
         self, position_mm: Floats, quaternion: Floats, tool: InstrumentConstants, opening_rad: float
     ) -> SceneBody:
         number = self._load("psm.urdf", position_mm, np.asarray(quaternion).tolist(), wrist_mm=tool.wrist_offset_mm)
-        found = [
-            self.bullet.getJointInfo(number, index, physicsClientId=self.client)
-            for index in range(self.bullet.getNumJoints(number, physicsClientId=self.client))
-        ]
+        found = [self.bullet.getJointInfo(number, index) for index in range(self.bullet.getNumJoints(number))]
         by_joint = {info[1].decode(): int(info[0]) for info in found}
         by_link = {info[12].decode(): int(info[0]) for info in found}
         arm = SceneBody(
@@ -317,20 +308,14 @@ class Simulator:
             shaft=by_link["roll_link"],
             surfaces=tuple(by_link[name] for name in LINKS),
         )
-        self.bullet.changeDynamics(number, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
-        lower, upper = in_metres(tool.lower).tolist(), in_metres(tool.upper).tolist()
-        for joint, index in enumerate(arm.joints):
+        self.bullet.changeDynamics(number, -1, linearDamping=0.0, angularDamping=0.0)
+        limits = in_metres(np.stack([tool.lower, tool.upper])).T.tolist()
+        for index, (lower, upper) in zip(arm.joints, limits, strict=True):
             # The file has the Classic's limits, a Si has others. A separate call, because with damping in the same call
             # the limits have no effect.
-            self.bullet.changeDynamics(
-                number,
-                index,
-                jointLowerLimit=lower[joint],
-                jointUpperLimit=upper[joint],
-                physicsClientId=self.client,
-            )
+            self.bullet.changeDynamics(number, index, jointLowerLimit=lower, jointUpperLimit=upper)
         for index in arm.fingers:
-            self.bullet.resetJointState(number, index, opening_rad, physicsClientId=self.client)
+            self.bullet.resetJointState(number, index, opening_rad)
         return arm
 
 
@@ -341,10 +326,8 @@ def _file(name: str, wrist_mm: float | None) -> Iterator[Path]:
         if wrist_mm is None or abs(wrist_mm - URDF_WRIST_MM) < 1e-6:
             yield path
             return
-        before, after = (
-            f'"0 {URDF_CENTRE_MM * MM:.4f} 0"',
-            f'"0 {(URDF_CENTRE_MM + wrist_mm - URDF_WRIST_MM) * MM:.4f} 0"',
-        )
+        centre_mm = (URDF_CENTRE_MM, URDF_CENTRE_MM + wrist_mm - URDF_WRIST_MM)
+        before, after = (f'"0 {up_mm * MM:.4f} 0"' for up_mm in centre_mm)
         text = path.read_text()
         assert text.count(before) == 1
         with TemporaryDirectory() as folder:
@@ -371,10 +354,7 @@ def simulate(given: BinaryIO, answer: BinaryIO) -> None:
     with opened(motion.instrument, motion.rate_hz) as scene:
         scene.set_up(motion, asked.pad_top_mm)
         kinematic = kinematic_pass(scene, asked)
-        shown = _pictured(motion)
-        scene.pose(motion.joints[shown])
-        if scene.psm_m is not None and motion.psm_m is not None:
-            scene.pose(motion.psm_m.joints[shown], scene.psm_m)
+        scene.show(motion, _pictured(motion))
         picture = pictures.draw(scene.photograph, _paths(motion))
         files, pad_mm = dict(sorted(scene.files.items())), scene.pad_mm
     # In a fresh scene: PSM_M would take two thirds of each step, and earlier contacts influence later steps.
@@ -405,14 +385,14 @@ def kinematic_pass(scene: Simulator, asked: PlayRequest) -> KinematicPass:
     distances = _Distances(scene, motion)
     values, places, turns = array("d"), array("d"), array("d")
     due = set(asked.looks.tolist())
-    bullet, client, arm = scene.bullet, scene.client, scene.arm
+    bullet, arm = scene.bullet, scene.arm
     put, read_joints, read_link = bullet.resetJointStatesMultiDof, bullet.getJointStates, bullet.getLinkState
     number, joints, tool = arm.number, arm.joints, arm.tool
     for k, row in enumerate(_rows(in_metres(motion.joints)[:, :, None])):
-        put(number, joints, row, physicsClientId=client)
-        a, b, c, d, e, f = read_joints(number, joints, client)
+        put(number, joints, row)
+        a, b, c, d, e, f = read_joints(number, joints)
         values.extend((a[0], b[0], c[0], d[0], e[0], f[0]))
-        frame = read_link(number, tool, 0, 1, client)
+        frame = read_link(number, tool, 0, 1)
         places.extend(frame[PLACE])
         turns.extend(frame[TURN])
         if k in due:
@@ -422,16 +402,7 @@ def kinematic_pass(scene: Simulator, asked: PlayRequest) -> KinematicPass:
         distances.at(k)
     read = _table(values, 6)
     read[:, INSERTION] /= MM
-    looked_at, order = distances.samples()
-    return KinematicPass(
-        tip_mm=_table(places, 3) / MM,
-        rotation_xyzw=_table(turns, 4),
-        joints=read,
-        looked_at=looked_at,
-        clearances_mm=distances.seen_mm()[order],
-        shaft_off_mm=distances.shaft_off_mm()[order],
-        psm_m_tip_mm=None if scene.psm_m is None else distances.psm_m_tip_mm()[order],
-    )
+    return KinematicPass(_table(places, 3) / MM, _table(turns, 4), read, *distances.in_order())
 
 
 def _rows(values: Floats) -> Iterator[Any]:
@@ -475,9 +446,8 @@ class _Distances:
         if scene.psm_m is not None and self._m_joints is not None:
             scene.pose(self._m_joints[sample], scene.psm_m)
             self._m_places.extend(scene.frame_of(scene.psm_m, scene.psm_m.tool)[0])
-        for pair in self._pairs:
-            columns = pair.columns
-            for point in scene.closest(pair.body, pair.other):  # a pair of capsules has one nearest point
+        for bodies, columns in self._pairs.items():
+            for point in scene.closest(*bodies):  # a pair of capsules has one nearest point
                 seen[columns[point[3], point[4]]] = point[8]
         self._samples.append(sample)
         self._seen.extend(seen)
@@ -489,42 +459,26 @@ class _Distances:
         """Return the distances in the order of measurement, shape (C, P)."""
         return _table(self._seen, len(self._nothing)) / MM
 
-    def samples(self) -> tuple[Ints, Ints]:
-        """Return the samples in ascending order, and their places in the order of measurement, shape (C,)."""
+    def in_order(self) -> tuple[Ints, Floats, Floats, Floats | None]:
+        """Return the samples in ascending order, and what a `KinematicPass` has at them."""
         order = np.argsort(self._samples)
-        return np.array(self._samples)[order], order
-
-    def shaft_off_mm(self) -> Floats:
-        """Return the distances of the shaft from its remote centre, in the order of measurement, shape (C,)."""
         place, along = _table(self._shaft_places, 3) / MM, matrix_of(_table(self._shaft_turns, 4))[:, :, 2]
-        return np.asarray(np.linalg.norm(np.cross(place, along), axis=1))
-
-    def psm_m_tip_mm(self) -> Floats:
-        """Return PSM_M's tip in the order of measurement, shape (C, 3)."""
-        return _table(self._m_places, 3) / MM
+        shaft_off_mm = np.linalg.norm(np.cross(place, along), axis=1)
+        m_mm = None if self._scene.psm_m is None else _table(self._m_places, 3)[order] / MM
+        return np.array(self._samples)[order], self.seen_mm()[order], shaft_off_mm[order], m_mm
 
 
-@dataclass(frozen=True)
-class _BodyPair:
-    """Two bodies, and the column of `link_pairs` for each pair of their links' indices."""
-
-    body: int
-    other: int
-    columns: dict[tuple[int, int], int]
-
-
-def _pairs_of_bodies(scene: Simulator) -> list[_BodyPair]:
-    """Return the pairs of bodies in the scene, with columns numbered as in `link_pairs`."""
+def _pairs_of_bodies(scene: Simulator) -> dict[tuple[int, int], dict[tuple[int, int], int]]:
+    """Return for each pair of bodies in the scene the column of `link_pairs` for each pair of their links' indices."""
     assert scene.pad is not None
-    on_pad = range(len(LINKS))
-    found = [_BodyPair(scene.arm.number, scene.pad, {(a, -1): k for k, a in enumerate(scene.arm.surfaces)})]
-    if scene.psm_m is not None:
-        both = [(a, m) for a in scene.arm.surfaces for m in scene.psm_m.surfaces]
-        columns = {pair: len(on_pad) + k for k, pair in enumerate(both)}
-        found.append(_BodyPair(scene.arm.number, scene.psm_m.number, columns))
-        first = len(on_pad) + len(both)
-        under_m = {(m, -1): first + k for k, m in enumerate(scene.psm_m.surfaces)}
-        found.append(_BodyPair(scene.psm_m.number, scene.pad, under_m))
+    places = {(PAD, PAD): (scene.pad, -1)}
+    for name, arm in ((PSM_A, scene.arm), (PSM_M, scene.psm_m)):
+        if arm is not None:
+            places |= {(name, link): (arm.number, index) for link, index in zip(LINKS, arm.surfaces, strict=True)}
+    found: dict[tuple[int, int], dict[tuple[int, int], int]] = {}
+    for column, pair in enumerate(link_pairs(scene.psm_m is not None)):
+        (body, link), (other, other_link) = places[pair.body, pair.link], places[pair.other, pair.other_link]
+        found.setdefault((body, other), {})[link, other_link] = column
     return found
 
 

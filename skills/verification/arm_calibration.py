@@ -143,31 +143,28 @@ class ArmCalibration:
         )
 
 
-def calibrate_arm(measured: MeasuredArm, *, name: str, blocks: int = BLOCKS) -> ArmCalibration:
+def calibrate_arm(measured: MeasuredArm, *, name: str) -> ArmCalibration:
     """Estimate a laboratory's own errors from setpoints and measured poses of an arm.
 
     Args:
         measured: The poses.
         name: The name to state the errors by.
-        blocks: Number of contiguous blocks of the cross-validation, at least 2.
 
     Raises:
         BadInput: The samples hold too few independent ones.
         BadSettings: The name is not possible.
     """
-    encoders_mm = encoder_errors_mm(measured, blocks)
+    encoders_mm = encoder_errors_mm(measured)
     turns_deg = np.degrees(vector_of(quaternion_of(np.swapaxes(measured.setpoint, 1, 2) @ measured.measured)))
     assumed_mm = sqrt(CALIBRATED.tip_bias_mm**2 + CALIBRATED.tip_noise_mm**2)
-    tip = _axes(encoders_mm, "mm", blocks, assumed_mm)
-    tracked = None
-    if measured.marker_mm is not None:
-        tracked = _axes(tracked_errors_mm(measured, blocks), "mm", blocks, assumed_mm)
+    tip = _axes(encoders_mm, "mm", assumed_mm)
+    tracked = None if measured.marker_mm is None else _axes(tracked_errors_mm(measured), "mm", assumed_mm)
     correlation_s = None if measured.stamps_s is None else _correlation_s(encoders_mm, measured.stamps_s)
     calibration = ArmCalibration(
         samples=len(encoders_mm),
         effective=sum(one.effective for one in tip),
         tip=tip,
-        wrist=_axes(turns_deg, "deg", blocks, CALIBRATED.wrist_deg),
+        wrist=_axes(turns_deg, "deg", CALIBRATED.wrist_deg),
         tracked=tracked,
         coverage=float(np.mean([one.coverage for one in tip])),
         correlation_s=correlation_s,
@@ -176,12 +173,11 @@ def calibrate_arm(measured: MeasuredArm, *, name: str, blocks: int = BLOCKS) -> 
     return replace(calibration, errors=_stated(calibration, encoders_mm, name))
 
 
-def encoder_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
+def encoder_errors_mm(measured: MeasuredArm) -> Floats:
     """Return the errors of the tip in the base frame by the encoders: measured position minus setpoint.
 
     Args:
-        measured: Setpoints and measured poses of N moments.
-        blocks: Number of blocks of the cross-validation; at least four samples are needed for each.
+        measured: Setpoints and measured poses of N moments; at least four are needed for each block.
 
     Returns:
         Errors in mm, shape (N, 3).
@@ -190,17 +186,17 @@ def encoder_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
         BadInput: The samples hold too few independent ones, or measured positions and setpoints differ by the same
             number throughout.
     """
-    errors_mm = np.asarray(measured.measured_mm - measured.setpoint_mm)
-    _check_number(errors_mm, blocks)
-    return errors_mm
+    return _checked(np.asarray(measured.measured_mm - measured.setpoint_mm))
 
 
-def tracked_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
+def tracked_errors_mm(measured: MeasuredArm) -> Floats:
     """Return the errors of the tip in the base frame by the tracker, beyond what a registration removes.
 
+    They are where the tracker shows the tip, minus its setpoint. Registration and the marker's place in the tool frame
+    are fitted in turn until they no longer change.
+
     Args:
-        measured: Setpoints of N moments, and the marker's positions.
-        blocks: Number of blocks of the cross-validation; at least four samples are needed for each.
+        measured: Setpoints of N moments, and the marker's positions; at least four are needed for each block.
 
     Returns:
         Errors in mm, shape (N, 3).
@@ -210,9 +206,20 @@ def tracked_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
     """
     if measured.marker_mm is None:
         raise BadInput("The recording has no tracker.")
-    errors_mm = _tracked_mm(measured, measured.marker_mm)
-    _check_number(errors_mm, blocks)
-    return errors_mm
+    tip, jaw, marker = measured.setpoint_mm, measured.setpoint, np.zeros(3)
+    seen = measured.marker_mm - measured.marker_mm.mean(axis=0)
+    for _ in range(_FITS):
+        expected = tip + jaw @ marker
+        centre = expected.mean(axis=0)
+        u, _, vt = np.linalg.svd((expected - centre).T @ seen)
+        turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt  # from the tracker's frame to the base's
+        shown = seen @ turn.T + centre
+        fitted = np.einsum("nji,nj->ni", jaw, shown - tip).mean(axis=0)
+        done = np.abs(fitted - marker).max() < _FITTED_MM
+        marker = fitted
+        if done:
+            break
+    return _checked(np.asarray(shown - tip - jaw @ marker))
 
 
 def _stated(found: ArmCalibration, encoders_mm: Floats, name: str) -> ArmErrors:
@@ -240,14 +247,14 @@ def _size(deviations: Sequence[float]) -> float:
     return float(f"{sqrt(sum(one**2 for one in deviations) / len(deviations)):.3g}")
 
 
-def _check_number(errors: Floats, blocks: int) -> None:
-    """Refuse errors, shape (N, 3), that are no measurement of an arm, or hold too few independent samples."""
+def _checked(errors: Floats) -> Floats:
+    """Return errors, shape (N, 3), unless they are no measurement of an arm, or hold too few independent samples."""
     if len(errors) and not (errors.std(axis=0) > _STILL_MM).all():
         raise BadInput(
             "Measured poses and setpoints differ by the same number throughout: the file has one of them twice, or is "
             "a simulator's. Record an arm."
         )
-    effective = [effective_number(errors[:, axis]) for axis in range(3)] if len(errors) >= 4 * blocks else [0.0]
+    effective = [effective_number(errors[:, axis]) for axis in range(3)] if len(errors) >= 4 * BLOCKS else [0.0]
     # negated, so that NaN fails
     if not (sum(effective) >= LEAST_EFFECTIVE and min(effective) >= LEAST_ALONG_AN_AXIS):
         raise BadInput(
@@ -257,17 +264,18 @@ def _check_number(errors: Floats, blocks: int) -> None:
             samples=len(errors),
             effective=sum(effective),
         )
+    return errors
 
 
 # ---- one axis ----------------------------------------------------------------------------------------------------
 
 
-def _axes(errors: Floats, unit: str, blocks: int, assumed: float) -> tuple[AxisErrors, ...]:
+def _axes(errors: Floats, unit: str, assumed: float) -> tuple[AxisErrors, ...]:
     """Return the figures of errors along three axes, shape (N, 3), beside a normal error of the assumed deviation."""
     half = _HALF_BAND * assumed
     found = []
     for axis, values in zip("xyz", errors.T, strict=True):
-        within, widths = _cross_validated(values, blocks)
+        within, widths = _cross_validated(values)
         found.append(
             AxisErrors(
                 axis=axis,
@@ -285,10 +293,10 @@ def _axes(errors: Floats, unit: str, blocks: int, assumed: float) -> tuple[AxisE
     return tuple(found)
 
 
-def _cross_validated(values: Floats, blocks: int) -> tuple[float, float]:
+def _cross_validated(values: Floats) -> tuple[float, float]:
     """Return the part of the samples within the band of the other blocks, and the mean width of these bands."""
     within, widths = 0, []
-    for block in np.array_split(np.arange(len(values)), blocks):
+    for block in np.array_split(np.arange(len(values)), BLOCKS):
         low, high = _band(np.delete(values, block))
         within += int(np.count_nonzero((values[block] >= low) & (values[block] <= high)))
         widths.append(high - low)
@@ -350,27 +358,3 @@ def _correlation_s(errors: Floats, stamps_s: Floats) -> float:
     step = float(np.median(np.diff(stamps_s)))
     keeps = (lasting - 1) / (lasting + 1)  # from 1 + 2 (r + r^2 + ...) = (1 + r) / (1 - r)
     return 0.0 if keeps <= exp(-700) else step / -log(keeps) if keeps < 1 else inf
-
-
-# ---- rotations and the tracker ---------------------------------------------------------------------------------------
-
-
-def _tracked_mm(measured: MeasuredArm, marker_mm: Floats) -> Floats:
-    """Return the tip's error in the base frame, shape (N, 3): where the tracker shows it, minus its setpoint.
-
-    Registration and the marker's place in the tool frame are fitted in turn until they no longer change.
-    """
-    tip, jaw, marker = measured.setpoint_mm, measured.setpoint, np.zeros(3)
-    seen = marker_mm - marker_mm.mean(axis=0)
-    for _ in range(_FITS):
-        expected = tip + jaw @ marker
-        centre = expected.mean(axis=0)
-        u, _, vt = np.linalg.svd((expected - centre).T @ seen)
-        turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt  # from the tracker's frame to the base's
-        shown = seen @ turn.T + centre
-        fitted = np.einsum("nji,nj->ni", jaw, shown - tip).mean(axis=0)
-        done = np.abs(fitted - marker).max() < _FITTED_MM
-        marker = fitted
-        if done:
-            break
-    return np.asarray(shown - tip - jaw @ marker)

@@ -11,31 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from skills import kinematics
 from skills.arrays import Flags, Floats
 from skills.fields import Count, Figure, schema
-from skills.kinematics import (
-    CANNULA_MM,
-    INSERTION,
-    JOINTS,
-    UNITS,
-    InstrumentConstants,
-    angle_between,
-    instrument_of,
-    joint_margins,
-    matrix_of,
-)
 from skills.planning.handoff import HOLDING_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory, joint_ratios
+from skills.verification import clearance
 from skills.verification.bodies import BodiesClearance
-from skills.verification.clearance import (
-    FINGER_REACH_MM,
-    Bounds,
-    needle_to_pad_mm,
-    openings,
-    psm_m_poses,
-    stands_from,
-)
 from skills.verification.deviations import LIMITS, Deviations
 from skills.verification.playback import PAD, Playback
 from skills.verification.scene_clearance import SceneClearance
@@ -54,7 +37,7 @@ class ArmSamples:
     """
 
     name: str
-    tool: InstrumentConstants
+    tool: kinematics.InstrumentConstants
     joints: Floats
     margins: Floats
     speed: Floats
@@ -82,7 +65,7 @@ class Figures:
     psm_m_fk_mm: Floats
     ticks: Floats
     effort: Floats
-    apart: Bounds
+    apart: clearance.Bounds
     needle_mm: Floats
 
 
@@ -98,7 +81,9 @@ def figures_of(playback: Playback, trajectory: Trajectory) -> Figures:
     psm_m_fk_mm = np.zeros(count)
     if m is not None and playback.psm_m_tip_mm is not None:
         arms.append(_arm(PSM_M, m.joints, m.instrument, trajectory.rate_hz))
-        psm_m_fk_mm[looked_at] = np.linalg.norm(playback.psm_m_tip_mm - psm_m_poses(trajectory, looked_at)[0], axis=1)
+        psm_m_fk_mm[looked_at] = np.linalg.norm(
+            playback.psm_m_tip_mm - clearance.psm_m_poses(trajectory, looked_at)[0], axis=1
+        )
     moving = {arm.name: (arm.joints, arm.instrument) for arm in trajectory.arms}
     return Figures(
         arms=tuple(arms),
@@ -106,21 +91,23 @@ def figures_of(playback: Playback, trajectory: Trajectory) -> Figures:
         fk_deg=_rotation_error_deg(playback.rotation_xyzw, trajectory.rotation_xyzw),
         psm_m_fk_mm=psm_m_fk_mm,
         ticks=np.append(1.0, np.diff(trajectory.stamps_s) * trajectory.rate_hz),
-        effort=(np.abs(playback.efforts) / np.array(instrument_of(trajectory.instrument).arm.effort)).max(axis=1),
-        apart=replace(
-            Bounds.of(moving, playback.link_pairs, looked_at, playback.clearances_mm),
-            # the simulator's fingers hold a needle
-            opened_mm=FINGER_REACH_MM * (openings(trajectory.arms[0]) - HOLDING_RAD),
+        effort=(np.abs(playback.efforts) / np.array(kinematics.instrument_of(trajectory.instrument).arm.effort)).max(
+            axis=1
         ),
-        needle_mm=needle_to_pad_mm(trajectory, looked_at, playback.pad_mm),
+        apart=replace(
+            clearance.Bounds.of(moving, playback.link_pairs, looked_at, playback.clearances_mm),
+            # the simulator's fingers hold a needle
+            opened_mm=clearance.FINGER_REACH_MM * (clearance.openings(trajectory.arms[0]) - HOLDING_RAD),
+        ),
+        needle_mm=clearance.needle_to_pad_mm(trajectory, looked_at, playback.pad_mm),
     )
 
 
 def _arm(name: str, joints: Floats, instrument: str, rate_hz: float) -> ArmSamples:
     """Return an arm's figures, all samples taken as one pass: the pose must not jump between passes either."""
-    tool = instrument_of(instrument)
+    tool = kinematics.instrument_of(instrument)
     speed, acceleration = joint_ratios(joints, np.zeros(len(joints), np.int64), rate_hz, instrument)
-    margins = joint_margins(joints, instrument) / (tool.upper - tool.lower)
+    margins = kinematics.joint_margins(joints, instrument) / (tool.upper - tool.lower)
     return ArmSamples(name, tool, joints, margins, speed, acceleration)
 
 
@@ -129,7 +116,7 @@ def _rotation_error_deg(measured: Floats, meant: Floats) -> Floats:
     length = np.linalg.norm(measured, axis=1)
     sound = np.abs(length - 1.0) < 1e-6
     safe = np.where(sound[:, None], measured, meant)
-    angle = np.degrees(angle_between(matrix_of(safe), matrix_of(meant)))
+    angle = np.degrees(kinematics.angle_between(kinematics.matrix_of(safe), kinematics.matrix_of(meant)))
     return np.where(sound, angle, np.nan)
 
 
@@ -163,7 +150,7 @@ class Limits:
     fk_mm: float = 0.01
     fk_deg: float = 0.01
     joint_margin: float = 0.0
-    insertion_mm: float = CANNULA_MM
+    insertion_mm: float = kinematics.CANNULA_MM
     speed_ratio: float = 1.000001
     acceleration_ratio: float = 1.000001
     tracking_mm: float = 0.1
@@ -292,13 +279,13 @@ def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
     prefix = "" if arm.name == PSM_A else f"{arm.name}'s "
     spare = limits.joint_margin * (arm.tool.upper - arm.tool.lower) - ROUND_OFF
     upper, lower = arm.tool.upper - spare, arm.tool.lower + spare
-    for joint, name in enumerate(JOINTS):
+    for joint, name in enumerate(kinematics.JOINTS):
         values = arm.joints[:, joint]
-        yield _Gate(f"{prefix}{name}", UNITS[joint], values, float(upper[joint]))
-        yield _Gate(f"{prefix}{name}", UNITS[joint], values, float(lower[joint]), at_least=True)
-    least_mm = limits.insertion_mm + arm.tool.cannula_mm - CANNULA_MM
-    yield _Gate(f"{prefix}insertion out of the cannula", "mm", arm.joints[:, INSERTION], least_mm, True)
-    for joint, name in enumerate(JOINTS):
+        yield _Gate(f"{prefix}{name}", kinematics.UNITS[joint], values, float(upper[joint]))
+        yield _Gate(f"{prefix}{name}", kinematics.UNITS[joint], values, float(lower[joint]), at_least=True)
+    least_mm = limits.insertion_mm + arm.tool.cannula_mm - kinematics.CANNULA_MM
+    yield _Gate(f"{prefix}insertion out of the cannula", "mm", arm.joints[:, kinematics.INSERTION], least_mm, True)
+    for joint, name in enumerate(kinematics.JOINTS):
         yield _Gate(f"speed of {prefix}{name}", "of its limit", arm.speed[:, joint], limits.speed_ratio)
         accelerations = arm.acceleration[:, joint]
         yield _Gate(f"acceleration of {prefix}{name}", "of its limit", accelerations, limits.acceleration_ratio)
@@ -324,7 +311,7 @@ def _handing_over(trajectory: Trajectory, apart: Floats, limit: float) -> Flags:
     """
     may = np.zeros(len(trajectory), dtype=bool)
     for end in trajectory.last_samples[trajectory.phase[trajectory.last_samples] == A2]:
-        may[stands_from(trajectory, int(end)) : end + 1] = True
+        may[clearance.stands_from(trajectory, int(end)) : end + 1] = True
         parted = (trajectory.phase[end + 1 :] != TRANSFER) | ~(apart[end + 1 :] < limit)
         may[end : end + 1 + int(np.argmax(np.append(parted, True)))] = True
     return may

@@ -39,38 +39,16 @@ from math import inf, isfinite
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills import kinematics
 from skills.arrays import Bytes, Flags, Floats, Ints
 from skills.errors import BadInput, BadSettings
 from skills.fields import Point
-from skills.kinematics import (
-    CANNULA_MM,
-    DEFAULT_INSTRUMENT,
-    INSERTION,
-    WRIST_MM,
-    axes_of,
-    forward,
-    instrument_of,
-    joint_margins,
-    solutions_of,
-)
 from skills.planning.handoff import HELD_MM, HOLDING_RAD, hand_off
 from skills.planning.motion_laws import Pose
 from skills.planning.trajectory import A2, PSM_M, PlannedArm, Trajectory
+from skills.verification import clearance
 from skills.verification.arm_errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors
 from skills.verification.bodies import too_near
-from skills.verification.clearance import (
-    FINGER_REACH_MM,
-    FINGERS,
-    STANDS,
-    HandOff,
-    Links,
-    catch,
-    clearance_between,
-    clearance_to_pad,
-    links_of,
-    openings,
-    travel_mm,
-)
 from skills.verification.error_draws import Displaced, Drawn, draw
 from skills.verification.gates import Limits
 from skills.verification.probabilities import (
@@ -116,32 +94,35 @@ class Planned(PlannedArm):
         """
         tip = (self.tip_mm + (shift_mm @ self.base)[:, None]).reshape(-1, 3)
         rotation, planned = (np.concatenate([one] * len(shift_mm)) for one in (self.rotation, self.joints))
-        tool = instrument_of(self.instrument)
-        solutions = solutions_of(tip, rotation, tool)
+        tool = kinematics.instrument_of(self.instrument)
+        solutions = kinematics.solutions_of(tip, rotation, tool)
         seconds = (np.abs(solutions - planned[:, None]) / tool.speed).sum(axis=2)
         nearest = np.where(np.isnan(seconds), np.inf, seconds).argmin(axis=1)
         return np.asarray(solutions[np.arange(len(tip)), nearest])
 
-    def links(self, joints: Floats) -> Links:
+    def links(self, joints: Floats) -> clearance.Links:
         """Return the arm's links in PSM_A's base frame, for the samples' joints once or for each variation."""
         openings_rad = np.tile(self.opening_rad, len(joints) // len(self.opening_rad))
-        return links_of(joints, self.instrument, openings_rad).seen_from(self.base, self.base_mm)
+        return clearance.links_of(joints, self.instrument, openings_rad).seen_from(self.base, self.base_mm)
 
     def poses_of(self, joints: Floats) -> tuple[Floats, Floats]:
         """Return the tips, (T, 3), and rotations [n o a], (T, 3, 3), of joints in PSM_A's base frame; NaN stays NaN."""
-        shaft, wrist, rotation = axes_of(joints)
-        depth_mm = joints[:, INSERTION] - instrument_of(self.instrument).wrist_offset_mm
-        tip = depth_mm[:, None] * shaft + WRIST_MM * wrist
+        shaft, wrist, rotation = kinematics.axes_of(joints)
+        depth_mm = joints[:, kinematics.INSERTION] - kinematics.instrument_of(self.instrument).wrist_offset_mm
+        tip = depth_mm[:, None] * shaft + kinematics.WRIST_MM * wrist
         return tip @ self.base.T + self.base_mm, self.base @ rotation
 
     def margins(self, joints: Floats) -> Floats:
         """Return each joint's distance from its nearer limit as a part of its range."""
-        tool = instrument_of(self.instrument)
-        return joint_margins(joints, self.instrument) / (tool.upper - tool.lower)
+        tool = kinematics.instrument_of(self.instrument)
+        return kinematics.joint_margins(joints, self.instrument) / (tool.upper - tool.lower)
 
     def insertion_mm(self, joints: Floats) -> Floats:
         """Return the insertion at which a tool on an arm of its own generation has its wrist as deep, shape (T,)."""
-        return np.asarray(joints[:, INSERTION] - (instrument_of(self.instrument).cannula_mm - CANNULA_MM))
+        return np.asarray(
+            joints[:, kinematics.INSERTION]
+            - (kinematics.instrument_of(self.instrument).cannula_mm - kinematics.CANNULA_MM)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +148,7 @@ class PlannedPass:
     @property
     def handing_over(self) -> Flags:
         """Samples, (S,), in which fingers may touch fingers: the end of A2, where all arms stand as in the last one."""
-        stands = [(np.abs(arm.joints - arm.joints[-1]) <= STANDS).all(axis=1) for arm in self.arms]
+        stands = [(np.abs(arm.joints - arm.joints[-1]) <= clearance.STANDS).all(axis=1) for arm in self.arms]
         there = np.logical_and.reduce([self.phase == A2, *stands])
         return np.asarray(np.logical_and.accumulate(there[::-1])[::-1])
 
@@ -187,8 +168,8 @@ def scene_of(
     samples = np.flatnonzero(trajectory.pass_index == number)
     arms = []
     for arm, unplanned_rad in zip(trajectory.arms, (HOLDING_RAD, opening_rad), strict=False):
-        joints, opened = arm.joints[samples], openings(arm, unplanned_rad)[samples]
-        tip_mm, rotation = forward(joints, arm.instrument)
+        joints, opened = arm.joints[samples], clearance.openings(arm, unplanned_rad)[samples]
+        tip_mm, rotation = kinematics.forward(joints, arm.instrument)
         planned = vars(arm) | {"joints": joints, "jaw_rad": None}
         arms.append(Planned(tip_mm=tip_mm, rotation=rotation, opening_rad=opened, **planned))
     recorded = trajectory.taking
@@ -208,11 +189,11 @@ def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
         stretches: Number of stretches per pass.
     """
     seen = [arm.links(arm.joints) for arm in scene.arms]
-    margins = [clearance_to_pad(one, scene.pad_top_mm, scene.pad_normal).min(axis=1) for one in seen]
+    margins = [clearance.clearance_to_pad(one, scene.pad_top_mm, scene.pad_normal).min(axis=1) for one in seen]
     margins += [arm.margins(arm.joints).min(axis=1) for arm in scene.arms]
     if len(seen) == 2:
         margins.append(_apart(seen[0], seen[1], scene.handing_over))
-    moved = sum(travel_mm(arm.joints, arm.instrument)[:, 1:].max(axis=1) for arm in scene.arms)
+    moved = sum(clearance.travel_mm(arm.joints, arm.instrument)[:, 1:].max(axis=1) for arm in scene.arms)
     travelled = np.append(0.0, np.cumsum(moved))
     stretch = np.floor(stretches * travelled / max(float(travelled[-1]), _STILL_MM))
     begins = np.flatnonzero(np.append(True, (np.diff(stretch) > 0) | (np.diff(scene.phase) != 0)))
@@ -272,7 +253,7 @@ def _spoiled(
     top = scene.pad_top_mm + np.repeat(shift_mm @ scene.pad_normal, samples)  # the pad moves with the pass
     handing_over = np.concatenate([scene.handing_over] * count)
     links = [arm.links(q) for arm, q in zip(scene.arms, joints, strict=True)]
-    above = [clearance_to_pad(one, top, scene.pad_normal).min(axis=1) for one in links]
+    above = [clearance.clearance_to_pad(one, top, scene.pad_normal).min(axis=1) for one in links]
     between = _apart(links[0], links[1], handing_over) if len(links) == 2 else np.full(count * samples, np.inf)
     levers = [_lever_mm(arm, one) for arm, one in zip(scene.arms, links, strict=True)]
     if scene.pad_top_mm > -inf:
@@ -287,11 +268,11 @@ def _spoiled(
         rows = np.flatnonzero(~clear & np.repeat(wanted[number], samples))
         variations, at = np.divmod(rows, samples)
         moved = [
-            _displaced(arm, Links(links[k].begin_mm[rows], links[k].end_mm[rows]), errors, k, variations, at)
+            _displaced(arm, clearance.Links(links[k].begin_mm[rows], links[k].end_mm[rows]), errors, k, variations, at)
             for k, arm in enumerate(scene.arms)
         ]
         if "pad" in found:
-            over = [clearance_to_pad(one, top[rows], scene.pad_normal).min(axis=1) for one in moved]
+            over = [clearance.clearance_to_pad(one, top[rows], scene.pad_normal).min(axis=1) for one in moved]
             near = np.minimum.reduce(over)
             found["pad"][number, variations[~(near >= limits.clearance_pad_mm)]] = True
         if len(moved) == 2:
@@ -300,7 +281,7 @@ def _spoiled(
     return found
 
 
-def _lever_mm(arm: Planned, links: Links) -> Floats:
+def _lever_mm(arm: Planned, links: clearance.Links) -> Floats:
     """Return the greatest distance of the links' axes from the arm's remote centre, shape (T,)."""
     ends = np.concatenate([links.begin_mm, links.end_mm], axis=1) - arm.base_mm
     return np.asarray(np.linalg.norm(ends, axis=2).max(axis=1))
@@ -308,7 +289,7 @@ def _lever_mm(arm: Planned, links: Links) -> Floats:
 
 def _at_most_mm(errors: Displaced, arm: int, lever_mm: Floats) -> Floats:
     """Return upper bounds on the distance by which errors move any point of an arm's links, shape (N, S)."""
-    turned = errors.jaw_rad[arm] * FINGER_REACH_MM
+    turned = errors.jaw_rad[arm] * clearance.FINGER_REACH_MM
     moved = np.linalg.norm(errors.tip_mm[arm], axis=2) + turned[:, None]
     if arm == 0:
         return np.asarray(moved)
@@ -316,7 +297,9 @@ def _at_most_mm(errors: Displaced, arm: int, lever_mm: Floats) -> Floats:
     return np.asarray(moved + np.linalg.norm(errors.base_mm, axis=1)[:, None] + errors.base_rad[:, None] * lever)
 
 
-def _displaced(arm: Planned, links: Links, errors: Displaced, number: int, variations: Ints, at: Ints) -> Links:
+def _displaced(
+    arm: Planned, links: clearance.Links, errors: Displaced, number: int, variations: Ints, at: Ints
+) -> clearance.Links:
     """Return the links of an arm where errors place it.
 
     Args:
@@ -326,14 +309,16 @@ def _displaced(arm: Planned, links: Links, errors: Displaced, number: int, varia
         variations: The variation of each pose, shape (R,).
         at: The sample of each pose, shape (R,).
     """
-    begin, end, hinge = links.begin_mm.copy(), links.end_mm.copy(), links.end_mm[:, FINGERS.start - 1, None]
+    begin, end, hinge = links.begin_mm.copy(), links.end_mm.copy(), links.end_mm[:, clearance.FINGERS.start - 1, None]
     for ends in (begin, end):
-        ends[:, FINGERS] = hinge + _turned(errors.jaw_turn[number, variations], ends[:, FINGERS] - hinge)
+        ends[:, clearance.FINGERS] = hinge + _turned(
+            errors.jaw_turn[number, variations], ends[:, clearance.FINGERS] - hinge
+        )
     by_mm = errors.tip_mm[number, variations, at]
     if number == 1:
         by_mm = by_mm + errors.base_mm[variations] + arm.base_mm
         begin, end = (_turned(errors.base_turn[variations], ends - arm.base_mm) for ends in (begin, end))
-    return Links(begin, end).moved(by_mm)
+    return clearance.Links(begin, end).moved(by_mm)
 
 
 def _turned(turn: Floats, points: Floats) -> Floats:
@@ -341,10 +326,10 @@ def _turned(turn: Floats, points: Floats) -> Floats:
     return np.asarray(points @ np.swapaxes(turn, 1, 2))
 
 
-def _apart(arm: Links, other: Links, handing_over: Flags) -> Floats:
+def _apart(arm: clearance.Links, other: clearance.Links, handing_over: Flags) -> Floats:
     """Return the arms' clearance, shape (T,), without that between fingers where they may touch."""
-    between = clearance_between(arm, other)
-    between[handing_over, FINGERS, FINGERS] = np.inf
+    between = clearance.clearance_between(arm, other)
+    between[handing_over, clearance.FINGERS, clearance.FINGERS] = np.inf
     return np.asarray(between.min(axis=(1, 2)))
 
 
@@ -398,20 +383,23 @@ def estimate_success(
     thin = [looked_at(scene, varied.stretches) for scene in scenes]
     under = [errors, *(one for one in (CALIBRATED, UNCALIBRATED) if one != errors)]
     spared = [size for size in CALLED if getattr(errors, size) > 0]
-    found = [
-        _judged(scene, draws, approach_m, under, [errors.without(size) for size in spared], varied, allowed)
-        for scene, draws in zip(thin, _draws(thin, seed, varied), strict=True)
-    ]
-    whole = np.logical_and.reduce([one.succeeds for one in found])
+    sizes = {"suture_point_mm": varied.suture_point_mm, "needle_rad": varied.needle_rad}
+    draws = [draw(seed, k, varied.variations, len(scene.phase), **sizes) for k, scene in enumerate(thin)]
+    without = [errors.without(size) for size in spared]
+    faults, succeeds = zip(
+        *(_judged(*one, approach_m, under, without, varied, allowed) for one in zip(thin, draws, strict=True)),
+        strict=True,
+    )
+    whole = np.logical_and.reduce(succeeds)
     costs = [Cost(size, share(~good)) for size, good in zip([*spared, NEEDLE], whole, strict=False)]
     return SuccessEstimate(
         seed=seed,
         pad_top_mm=None if pad_top_mm is None else top_mm,
         with_psm_m=trajectory.psm_m is not None,
-        hand_offs=sum("place" in one.faults for one in found),
+        hand_offs=sum("place" in one for one in faults),
         looked_at=tuple(len(scene.phase) for scene in thin),
         under=tuple(
-            counted([{name: one[k] for name, one in each.faults.items()} for each in found], one)
+            counted([{name: one[k] for name, one in each.items()} for each in faults], one)
             for k, one in enumerate(under)
         ),
         settings=varied,
@@ -422,24 +410,7 @@ def estimate_success(
     )
 
 
-def _draws(scenes: Sequence[PlannedPass], seed: int, varied: EstimateSettings) -> list[Drawn]:
-    sizes = {"suture_point_mm": varied.suture_point_mm, "needle_rad": varied.needle_rad}
-    return [draw(seed, k, varied.variations, len(scene.phase), **sizes) for k, scene in enumerate(scenes)]
-
-
 # ---- one pass --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Judged:
-    """A pass in N variations.
-
-    `faults` has for each judged fault whether it occurs under each of E errors, shape (E, N); `succeeds` has the
-    success without one size of the stated errors each, and last with a needle that stands as planned, shape (C, N).
-    """
-
-    faults: dict[str, Flags]
-    succeeds: Flags
 
 
 def _judged(
@@ -450,8 +421,13 @@ def _judged(
     spared: Sequence[ArmErrors],
     varied: EstimateSettings,
     limits: Limits,
-) -> _Judged:
-    """Judge a pass under some errors, and whether it succeeds under the `spared` ones."""
+) -> tuple[dict[str, Flags], Flags]:
+    """Judge a pass in N variations under some errors, and whether it succeeds under the `spared` ones.
+
+    Returns:
+        For each judged fault whether it occurs under each of E errors, shape (E, N); and the success without one size
+        of the stated errors each, and last with a needle that stands as planned, shape (C, N).
+    """
     displaced = [drawn.under(one, scene.stamps_s) for one in [*under, *spared]]
     arms = at_hand_off(scene, approach_m, varied.unknown_depth_mm)
     missed: dict[str, Flags] = {}
@@ -468,7 +444,7 @@ def _judged(
     spoilt = np.logical_or.reduce(list(found.values()))
     good = ~(lost | spoilt)[len(under) :]
     faults = {name: one[: len(under)] for name, one in (found | missed).items()}
-    return _Judged(faults, np.concatenate([good, ~(upright | spoilt[0])[None]]))
+    return faults, np.concatenate([good, ~(upright | spoilt[0])[None]])
 
 
 def at_hand_off(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: float) -> tuple[Planned, Planned] | None:
@@ -493,12 +469,14 @@ def at_hand_off(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: floa
         return None
     # An arm of which the base is not known: straight, and as deep as arms usually are.
     joints = np.zeros((1, 6))
-    joints[:, INSERTION] = depth_mm + instrument_of(DEFAULT_INSTRUMENT).wrist_offset_mm - WRIST_MM
-    (own_tip,), (own_jaw,) = forward(joints)
+    joints[:, kinematics.INSERTION] = (
+        depth_mm + kinematics.instrument_of(kinematics.DEFAULT_INSTRUMENT).wrist_offset_mm - kinematics.WRIST_MM
+    )
+    (own_tip,), (own_jaw,) = kinematics.forward(joints)
     base = jaw @ own_jaw.T
     return arm, Planned(
         name=PSM_M,
-        instrument=DEFAULT_INSTRUMENT,
+        instrument=kinematics.DEFAULT_INSTRUMENT,
         joints=joints,
         jaw_rad=None,
         base=base,
@@ -524,7 +502,7 @@ def caught_by(
     `catch` has PSM_M's jaws as planned, so PSM_A is taken to where it is relative to them.
     """
     (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses_of(arm.joints) for arm in arms)
-    planned = HandOff(tip_a[0], jaw_a[0], tip_m[0], jaw_m[0])
+    planned = clearance.HandOff(tip_a[0], jaw_a[0], tip_m[0], jaw_m[0])
     (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses_of(arm.shifted(shift_mm)) for arm in arms)
     jaw_a, jaw_m, centre = errors.jaw_turn[0] @ jaw_a, errors.jaw_turn[1] @ jaw_m, arms[1].base_mm
     tip_m = np.einsum("nij,nj->ni", errors.base_turn, tip_m - centre) + centre + errors.base_mm
@@ -532,5 +510,5 @@ def caught_by(
     askew = jaw_a @ planned.jaw_a.T
     grip = tip_a + errors.tip_mm[0, :, -1] + HELD_MM * jaw_a[:, :, 2] - tip_m - errors.tip_mm[1, :, -1]
     apart = np.einsum("nij,nj->ni", back, grip) - (planned.tip_a + HELD_MM * planned.jaw_a[:, 2] - planned.tip_m)
-    place, angle = catch(planned, back @ askew @ turned, apart, varied.opening_rad)
+    place, angle = clearance.catch(planned, back @ askew @ turned, apart, varied.opening_rad)
     return place, angle <= varied.stated_rad

@@ -225,7 +225,7 @@ class PassComparison:
         if speed.max(initial=0.0) < _LEAST_MM:
             return
         still = (speed <= STILL * speed.max()) & (rate <= STILL * rate.max())
-        self.put("standing still", self.a1[:-1], _standing(still) / self.rate_hz / allowed_s[:-1])
+        self.put("standing still", self.a1[:-1], _still_samples(still) / self.rate_hz / allowed_s[:-1])
 
     # ---- A2 and PSM_M ----------------------------------------------------------------------------------------------
 
@@ -386,7 +386,7 @@ class PassComparison:
         if self.other is not None:  # while both stand the needle changes hands
             begins = stands_from(self.motion, int(rows[-1]))
             still[(rows[:-1] >= begins) & (rows[:-1] < begins + 2 * ceil(JAW_S * self.rate_hz))] = False
-        self.put("standing still", rows[:-1], _standing(still) / self.rate_hz / allowed_s)
+        self.put("standing still", rows[:-1], _still_samples(still) / self.rate_hz / allowed_s)
 
 
 def _far_mm(tip_mm: Floats, place_mm: Floats) -> Floats:
@@ -406,7 +406,7 @@ def _rates(arm: Poses, rows: Ints) -> tuple[Floats, Floats]:
     return speed, _apart_deg(arm.rotation[rows[:-1]], arm.rotation[rows[1:]])
 
 
-def _standing(still: Flags) -> Floats:
+def _still_samples(still: Flags) -> Floats:
     """Return for each sample the number of samples that are still without a break up to it."""
     index = np.arange(1, len(still) + 1)
     return np.asarray(index - np.maximum.accumulate(np.where(still, 0, index)), np.float64)

@@ -25,34 +25,16 @@ from typing import Literal
 
 import numpy as np
 
+from skills import kinematics
 from skills.arrays import Flags, Floats, Ints, xyz
 from skills.errors import BadPlan
 from skills.fields import Figure, Point, Quaternion, schema
-from skills.kinematics import (
-    CANNULA_MM,
-    INSERTION,
-    JOINTS,
-    ROLL,
-    InstrumentConstants,
-    instrument_of,
-    matrix_of,
-    quaternion_of,
-    solutions_of,
-)
 from skills.planning.handoff import HOLDING_RAD, OtherArm
 from skills.planning.motion_laws import Poses
 from skills.planning.plan import Pass, SuturePlan
 from skills.planning.trajectory import PSM_A, PSM_M, PassPoses, Trajectory, poses_along
+from skills.verification import clearance
 from skills.verification.bodies import distances_at, moved_mm
-from skills.verification.clearance import (
-    FINGER_REACH_MM,
-    FINGERS,
-    clearance_between,
-    links_of,
-    needle_travel_mm,
-    openings,
-    travel_mm,
-)
 from skills.verification.gates import Limits
 from skills.verification.scene_clearance import LOOK_MM, TISSUE, from_parts, groups_of, limit_of, needle_from_tissue
 
@@ -142,18 +124,18 @@ class _Moved:
         by, count = positions_mm - np.array(one.point.position_mm), len(positions_mm)
         self.yes, self.no = np.ones(count, bool), np.zeros(count, bool)
         self.because: list[str | None] = [None] * count
-        self.figures = {name: np.full(count, np.nan) for name in ("bodies", "tools", "scene", "needle")}
-        self.figures |= {name: np.full(count, np.inf) for name in ("turn", "insertion")}
+        self.figures = {f"{name}_mm": np.full(count, np.nan) for name in ("bodies", "tools", "scene", "needle")}
+        self.figures |= {name: np.full(count, np.inf) for name in ("turn_margin_deg", "insertion_margin_mm")}
         self.joints = self._solved(poses.arms[0], by, PSM_A, plan.instrument)
         self.other, psm_m = None, plan.psm_m
         if len(poses.arms) == 2 and psm_m is not None:
-            base = matrix_of(np.array([psm_m.base_xyzw]))[0]
+            base = kinematics.matrix_of(np.array([psm_m.base_xyzw]))[0]
             seen = Poses((poses.arms[1].tip_mm - np.array(psm_m.base_mm)) @ base, base.T @ poses.arms[1].rotation)
             either = [
                 self._solved(way, by @ base, PSM_M, psm_m.instrument)
                 for way in (seen, Poses(seen.tip_mm, seen.rotation @ _HINGE_REVERSED))
             ]
-            rolls = [np.abs(q[:, :, ROLL]).max(axis=1) for q in either]
+            rolls = [np.abs(q[:, :, kinematics.ROLL]).max(axis=1) for q in either]
             self.other = np.where((rolls[0] <= rolls[1])[:, None, None], *either)
 
     def places(self) -> list[ReachPlace]:
@@ -163,43 +145,35 @@ class _Moved:
             vague = [self._compare(some, every) for some in self._portions(rows)]
             rows = np.concatenate([np.empty(0, np.int64), *vague])
         answers = np.where(self.no, "no", np.where(self.yes, "yes", "in doubt")).tolist()
-        figures = {name: [_figure(value) for value in values.tolist()] for name, values in self.figures.items()}
-        return [
-            ReachPlace(
-                position_mm=xyz(position),
-                rotation_xyzw=self.one.point.rotation_xyzw,
-                reach=answers[k],
-                limited_by=self.because[k],
-                turn_margin_deg=figures["turn"][k],
-                insertion_margin_mm=figures["insertion"][k],
-                bodies_mm=figures["bodies"][k],
-                tools_mm=figures["tools"][k],
-                scene_mm=figures["scene"][k],
-                needle_mm=figures["needle"][k],
-            )
-            for k, position in enumerate(self.positions)
-        ]
+        found, turned = [], self.one.point.rotation_xyzw
+        for k, position in enumerate(self.positions):
+            figures = {name: float(one[k]) if isfinite(one[k]) else None for name, one in self.figures.items()}
+            found.append(ReachPlace(xyz(position), turned, answers[k], self.because[k], **figures))
+        return found
 
     # ---- joints ----------------------------------------------------------------------------------------------------
 
     def _solved(self, poses: Poses, by_mm: Floats, arm: str, instrument: str) -> Floats:
         """Return the joints at all positions, (P, S, 6), after comparing them with their limits."""
-        tool = instrument_of(instrument)
+        tool = kinematics.instrument_of(instrument)
         q, beyond = _joints(poses, by_mm, tool)
         steps = np.abs(np.diff(q, axis=1))
         step = np.concatenate([steps[:, :1], np.maximum(steps[:, :-1], steps[:, 1:]), steps[:, -1:]], axis=1)
         step = np.concatenate([step[:, :1], np.maximum(step[:, :-1], step[:, 1:])], axis=1)
         step[:, :-1] = np.maximum(step[:, :-1], step[:, 1:])
         lower = tool.lower.copy()
-        lower[INSERTION] = max(lower[INSERTION], self.limits.insertion_mm + tool.cannula_mm - CANNULA_MM)
+        lower[kinematics.INSERTION] = max(
+            lower[kinematics.INSERTION], self.limits.insertion_mm + tool.cannula_mm - kinematics.CANNULA_MM
+        )
         margin = np.minimum(q - lower, tool.upper - q)
-        furthest = np.where(np.arange(6) == INSERTION, LEAP_MM, LEAP_RAD)
+        furthest = np.where(np.arange(6) == kinematics.INSERTION, LEAP_MM, LEAP_RAD)
         smooth: Flags = np.all(steps <= furthest, axis=1)
-        for joint, name in enumerate(JOINTS):
+        for joint, name in enumerate(kinematics.JOINTS):
             mine, spare = margin[:, :, joint], step[:, :, joint]
             no = ~(mine + np.where(beyond[:, None], 0.0, spare) >= 0).all(axis=1) & (smooth[:, joint] | beyond)
             yes = (mine - spare >= 0).all(axis=1) & smooth[:, joint]
-            figure, unit = ("insertion", 1.0) if joint == INSERTION else ("turn", 180 / pi)
+            turns = joint != kinematics.INSERTION
+            figure, unit = ("turn_margin_deg", 180 / pi) if turns else ("insertion_margin_mm", 1.0)
             least = np.minimum(self.figures[figure], mine.min(axis=1) * unit)
             self._judge(np.arange(len(q)), _Check(f"{arm}'s {name}", yes, no, figure, least))
         self.no |= beyond
@@ -249,7 +223,7 @@ class _Moved:
             instrument=self.plan.instrument,
             stamps_s=np.arange(count * samples, dtype=np.float64),
             tip_mm=(arm.tip_mm + by[:, None]).reshape(-1, 3),
-            rotation_xyzw=np.tile(quaternion_of(arm.rotation), (count, 1)),
+            rotation_xyzw=np.tile(kinematics.quaternion_of(arm.rotation), (count, 1)),
             joints=self.joints[rows].reshape(-1, 6),
             pass_index=np.repeat(np.arange(count), samples),
             phase=np.tile(self.poses.phase, count),
@@ -268,11 +242,16 @@ class _Moved:
             ways = [moved_mm(arm.joints, np.roll(arm.joints, -1, axis=0), arm.instrument) for arm in arms]
             apart = distances_at(motion, looks.rows)
             yield looks.check("bodies", apart, looks.of_both(ways), self.limits.clearance_bodies_mm)
-            links = [links_of(arm.joints[looks.rows], arm.instrument).seen_from(arm.base, arm.base_mm) for arm in arms]
-            apart = clearance_between(*links)
-            apart[:, FINGERS] -= FINGER_REACH_MM * (openings(arms[0])[looks.rows, None, None] - HOLDING_RAD)
-            looks.per_place(apart)[:, -1, FINGERS, FINGERS] = np.inf  # the needle changes hands
-            ways = [_with_last(travel_mm(arm.joints, arm.instrument)) for arm in arms]
+            links = [
+                clearance.links_of(arm.joints[looks.rows], arm.instrument).seen_from(arm.base, arm.base_mm)
+                for arm in arms
+            ]
+            apart = clearance.clearance_between(*links)
+            apart[:, clearance.FINGERS] -= clearance.FINGER_REACH_MM * (
+                clearance.openings(arms[0])[looks.rows, None, None] - HOLDING_RAD
+            )
+            looks.per_place(apart)[:, -1, clearance.FINGERS, clearance.FINGERS] = np.inf  # the needle changes hands
+            ways = [_with_last(clearance.travel_mm(arm.joints, arm.instrument)) for arm in arms]
             yield looks.check("tools", apart, looks.of_both(ways), self.limits.clearance_psm_m_mm)
         if scene is None:
             return
@@ -288,12 +267,12 @@ class _Moved:
                 "scene",
                 np.all([one.yes for one in found], axis=0),
                 np.any([one.no for one in found], axis=0),
-                "scene",
+                "scene_mm",
                 np.min([one.least for one in found], axis=0),
             )
         if scene.tissue is not None:
             apart = needle_from_tissue(motion, scene.tissue, looks.rows)[TISSUE]
-            way = looks.split(_with_last(needle_travel_mm(motion)[:, None]))
+            way = looks.split(_with_last(clearance.needle_travel_mm(motion)[:, None]))
             check = looks.check("needle", apart, way, 0.0, LOOK_MM / 2)
             # One that begins in the tissue comes out first, by hand; until when, a few poses do not tell.
             begins = looks.per_place(apart)[:, 0, 0]
@@ -336,7 +315,8 @@ class _Looks:
         least = seen.min(axis=axes)
         lower = ((seen[:, :-1] + seen[:, 1:] - np.diff(gone, axis=1)) / 2).min(axis=axes)
         slack = np.maximum(look_mm, TICK * way.max(axis=axes))
-        return _Check(name, np.minimum(lower, least) - slack >= limit_mm, ~(least + slack >= limit_mm), name, least)
+        yes, no = np.minimum(lower, least) - slack >= limit_mm, ~(least + slack >= limit_mm)
+        return _Check(name, yes, no, f"{name}_mm", least)
 
 
 def _with_last(steps: Floats) -> Floats:
@@ -344,11 +324,7 @@ def _with_last(steps: Floats) -> Floats:
     return np.concatenate([steps, np.zeros_like(steps[:1])])
 
 
-def _figure(value: float) -> float | None:
-    return value if isfinite(value) else None
-
-
-def _joints(poses: Poses, by_mm: Floats, tool: InstrumentConstants) -> tuple[Floats, Flags]:
+def _joints(poses: Poses, by_mm: Floats, tool: kinematics.InstrumentConstants) -> tuple[Floats, Flags]:
     """Solve S poses moved to P places as `skills.planning.passes.solve` does.
 
     Returns:
@@ -358,7 +334,7 @@ def _joints(poses: Poses, by_mm: Floats, tool: InstrumentConstants) -> tuple[Flo
     count, samples = len(by_mm), len(poses)
     tip = (poses.tip_mm + by_mm[:, None]).reshape(-1, 3)
     rotation = np.broadcast_to(poses.rotation, (count, samples, 3, 3)).reshape(-1, 3, 3)
-    solutions = solutions_of(tip, rotation, tool).reshape(count, samples, 6, 6)
+    solutions = kinematics.solutions_of(tip, rotation, tool).reshape(count, samples, 6, 6)
     parts = np.minimum(solutions - tool.lower, tool.upper - solutions) / (tool.upper - tool.lower)
     worst = np.nan_to_num(parts.min(axis=3), nan=-np.inf)
     allowed = worst >= -1e-9
@@ -371,7 +347,7 @@ def _joints(poses: Poses, by_mm: Floats, tool: InstrumentConstants) -> tuple[Flo
         reached = allowed[:, sample].any(axis=1)
         best = np.where(reached, way.argmin(axis=1), worst[:, sample].argmax(axis=1))
         before = chosen[:, sample] = here[every, best]
-    roll = np.unwrap(chosen[:, :, ROLL], axis=1)
+    roll = np.unwrap(chosen[:, :, kinematics.ROLL], axis=1)
     middle = (roll.max(axis=1) + roll.min(axis=1)) / (4 * pi)
-    chosen[:, :, ROLL] = roll - 2 * pi * np.round(middle)[:, None]
+    chosen[:, :, kinematics.ROLL] = roll - 2 * pi * np.round(middle)[:, None]
     return chosen, ~(worst.max(axis=2) >= -BEYOND).all(axis=1)

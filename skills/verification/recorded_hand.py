@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from skills.arrays import Flags, Floats, Ints
+from skills.arrays import Flags, Floats, Ints, interpolated
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.movement import same_signs
+from skills.demonstration.movement import runs, same_signs
 from skills.kinematics import angle_between, instrument_of, matrix_of
 
 # Ours: planning averages a hand over a quarter of a second, and its tip twice.
@@ -56,12 +56,12 @@ class RecordedHand:
         count = int(np.ceil(demo.stamps_s[-1] / _STEP_S) + 2 * before + 1)
         fine_s = (np.arange(count) - before) * _STEP_S
         seconds = fine_s[half:-half]
-        tip, tip_spread = _spread(_at(fine_s, demo.stamps_s, demo.tip_mm), half)
+        tip, tip_spread = _spread(interpolated(fine_s, demo.stamps_s, demo.tip_mm), half)
         speed = np.linalg.norm(np.gradient(tip, axis=0), axis=1)
         slow = speed <= SLOW * speed.max()
         calm, turned, turned_spread = slow, None, np.zeros(len(seconds))
         if demo.rotation_xyzw is not None:
-            near = _at(fine_s, demo.stamps_s, same_signs(demo.rotation_xyzw))
+            near = interpolated(fine_s, demo.stamps_s, same_signs(demo.rotation_xyzw))
             mean, apart = _spread(near / np.linalg.norm(near, axis=1, keepdims=True), half)
             turned = matrix_of(mean / np.linalg.norm(mean, axis=1, keepdims=True))
             turned_spread = np.degrees(2 * apart)  # a unit quaternion moves by half of the angle
@@ -90,10 +90,6 @@ class RecordedHand:
         return np.linspace(first, last, min(last - first + 1, MOMENTS)).astype(np.int64)
 
 
-def _at(times: Floats, seconds: Floats, columns: Floats) -> Floats:
-    return np.stack([np.interp(times, seconds, column) for column in columns.T], axis=1)
-
-
 def _spread(values: Floats, half: int) -> tuple[Floats, Floats]:
     """Return the mean of rows, (N, D), over a window, and the greatest distance from it within the window."""
     windows = sliding_window_view(values, 2 * half + 1, axis=0)
@@ -103,9 +99,8 @@ def _spread(values: Floats, half: int) -> tuple[Floats, Floats]:
 
 def _unbroken_s(slow: Flags) -> Floats:
     """Return the length of the run of slow moments around each, within `HALF_S` of it, shape (N,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], slow, [False])).astype(np.int8)))
-    runs = np.zeros(len(slow))
-    for begin, end in edges.reshape(-1, 2).tolist():
-        runs[begin:end] = (end - begin) * _STEP_S
+    lasting = np.zeros(len(slow))
+    for begin, end in runs(slow):
+        lasting[begin:end] = (end - begin) * _STEP_S
     half = 2 * round(HALF_S / _STEP_S)
-    return np.asarray(sliding_window_view(np.pad(runs, half), 2 * half + 1).max(axis=1))
+    return np.asarray(sliding_window_view(np.pad(lasting, half), 2 * half + 1).max(axis=1))

@@ -33,22 +33,9 @@ from skills.gridworld.scene import Scene, Tissue
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
 from skills.planning.motion_laws import A2, TRANSFER
 from skills.planning.trajectory import PSM_A, PSM_M, PlannedArm, SampleMoment, Trajectory
+from skills.verification import clearance
 from skills.verification.bodies import ABOVE_TISSUE, TOOL, moved_mm, names_of, parts_of, radii_of
-from skills.verification.clearance import (
-    ARC_BULGE_MM,
-    FINGER_REACH_MM,
-    FINGERS,
-    NEEDLE_THICK_MM,
-    RADII_MM,
-    Links,
-    links_of,
-    needle_arc_mm,
-    needle_travel_mm,
-    openings,
-    psm_m_poses,
-    travel_mm,
-    way_mm,
-)
+from skills.verification.clearance import way_mm
 from skills.verification.playback import CLEARANCE_SEEN_MM, LINKS
 
 LEAST_MM = 1.0  # ours, as of the pad: the error of a calibrated arm (0.65 mm) and half as much again
@@ -149,7 +136,7 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
         nearest += [_nearest(trajectory, arm.name, group.names, part, looks, apart) for part, apart in of_parts.items()]
     needle = np.full(len(trajectory), np.inf)
     if scene.tissue is not None:
-        way = way_mm(needle_travel_mm(trajectory)[:, None])
+        way = way_mm(clearance.needle_travel_mm(trajectory)[:, None])
         begins = np.flatnonzero(np.diff(trajectory.phase) | np.diff(trajectory.pass_index)) + 1
         ends = np.concatenate([begins - 1, begins])
         looks, seen = _looked_at(partial(needle_from_tissue, trajectory, scene.tissue), way, LOOK_MM, 0.0, ends)
@@ -200,7 +187,7 @@ class Group:
     radii_mm: Floats
     way_mm: Floats
     look_mm: float
-    axes: Callable[[Ints], tuple[Links, ...]]
+    axes: Callable[[Ints], tuple[clearance.Links, ...]]
     above_tissue: Flags
 
 
@@ -214,25 +201,25 @@ def groups_of(trajectory: Trajectory) -> list[tuple[PlannedArm, Group]]:
 
 
 def _tool(arm: PlannedArm) -> Group:
-    steps = travel_mm(arm.joints, arm.instrument)
+    steps = clearance.travel_mm(arm.joints, arm.instrument)
     if arm.name == PSM_A:
-        steps[:, FINGERS] += FINGER_REACH_MM * np.abs(np.diff(openings(arm)))[:, None]
-    return Group(LINKS, RADII_MM, way_mm(steps), LOOK_MM, partial(links_at, arm), np.ones(len(LINKS), bool))
+        steps[:, clearance.FINGERS] += clearance.FINGER_REACH_MM * np.abs(np.diff(clearance.openings(arm)))[:, None]
+    return Group(LINKS, clearance.RADII_MM, way_mm(steps), LOOK_MM, partial(links_at, arm), np.ones(len(LINKS), bool))
 
 
 def _bodies(arm: PlannedArm) -> Group:
     names = names_of(arm.instrument)[: -len(TOOL)]
     way = way_mm(moved_mm(arm.joints[:-1], arm.joints[1:], arm.instrument)[:, : len(names)])
 
-    def axes(at: Ints) -> tuple[Links, ...]:
+    def axes(at: Ints) -> tuple[clearance.Links, ...]:
         parts = parts_of(arm.joints[at], arm.instrument).seen_from(arm.base, arm.base_mm)
-        return (Links(parts.begin_mm[:, : len(names)], parts.end_mm[:, : len(names)]),)
+        return (clearance.Links(parts.begin_mm[:, : len(names)], parts.end_mm[:, : len(names)]),)
 
     radii, above = radii_of(arm.instrument)[: len(names)], np.isin(names, ABOVE_TISSUE)
     return Group(names, radii, way, LOOK_BODIES_MM, axes, above)
 
 
-def links_at(arm: PlannedArm, at: Ints) -> tuple[Links, ...]:
+def links_at(arm: PlannedArm, at: Ints) -> tuple[clearance.Links, ...]:
     """Return an arm's links at some samples, in the frame of PSM_A's base; PSM_M's with each opening of its jaw.
 
     Args:
@@ -242,8 +229,10 @@ def links_at(arm: PlannedArm, at: Ints) -> tuple[Links, ...]:
     Returns:
         The links in C poses, once for PSM_A, and for each of `JAWS_RAD` for PSM_M.
     """
-    jaws: list[ArrayLike] = [openings(arm)[at]] if arm.name == PSM_A else [*JAWS_RAD]
-    return tuple(links_of(arm.joints[at], arm.instrument, jaw).seen_from(arm.base, arm.base_mm) for jaw in jaws)
+    jaws: list[ArrayLike] = [clearance.openings(arm)[at]] if arm.name == PSM_A else [*JAWS_RAD]
+    return tuple(
+        clearance.links_of(arm.joints[at], arm.instrument, jaw).seen_from(arm.base, arm.base_mm) for jaw in jaws
+    )
 
 
 def _looks(way_mm: Floats, look_mm: float) -> Ints:
@@ -350,7 +339,7 @@ def needle_from_tissue(trajectory: Trajectory, tissue: Tissue, at: Ints) -> dict
     Returns:
         Bounds in mm, negative inside, shape (C, 1), by the name `TISSUE`.
     """
-    arc_mm, thick_mm = needle_arc_mm(trajectory, at), NEEDLE_THICK_MM / 2 + ARC_BULGE_MM
+    arc_mm, thick_mm = clearance.needle_arc_mm(trajectory, at), clearance.NEEDLE_THICK_MM / 2 + clearance.ARC_BULGE_MM
     # The chords from point to point, because a ridge may be between two of them.
     apart = tissue.from_lines_mm(arc_mm[:, :-1], arc_mm[:, 1:], within_mm=CLEARANCE_SEEN_MM + thick_mm)
     return {TISSUE: apart.min(axis=1)[:, None] - thick_mm}
@@ -386,7 +375,7 @@ def flat_tissue(trajectory: Trajectory, report: SceneReport, tissue: Tissue) -> 
         return float(up @ tissue.at_mm) + tissue.heights_mm[0][0], xyz(up)
     every = np.arange(len(trajectory))
     lowest = min(
-        float((np.minimum(one.begin_mm @ up, one.end_mm @ up) - RADII_MM).min())
+        float((np.minimum(one.begin_mm @ up, one.end_mm @ up) - clearance.RADII_MM).min())
         for arm in trajectory.arms
         for one in links_at(arm, every)
     )
@@ -401,6 +390,8 @@ def _nearest(
     """Return the least distance of an arm or the needle from a part, NaN before all, and where it is."""
     look, link = np.unravel_index(int(np.nan_to_num(apart_mm, nan=-np.inf).argmin()), apart_mm.shape)
     sample, least = int(looks[look]), float(apart_mm[look, link])
-    tip = psm_m_poses(trajectory, looks[look : look + 1])[0][0] if body == PSM_M else trajectory.tip_mm[sample]
+    tip = (
+        clearance.psm_m_poses(trajectory, looks[look : look + 1])[0][0] if body == PSM_M else trajectory.tip_mm[sample]
+    )
     moment = vars(trajectory.moment(sample))
     return least, NearestToScene(body=body, link=names[link], part=part, least_mm=least, tip_mm=xyz(tip), **moment)

@@ -19,18 +19,11 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills import kinematics
 from skills.arrays import Floats, frozen
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput
 from skills.fields import Count, Figure, Sha256, schema
-from skills.kinematics import (
-    INSERTION,
-    JOINTS,
-    UNITS,
-    InstrumentConstants,
-    angle_between,
-    matrix_of,
-)
 from skills.learning.policy import Policy
 from skills.notebook import card
 from skills.planning.motion_laws import A2, PHASES
@@ -71,7 +64,7 @@ class ArmFigures:
     """One arm: the constants of its instrument, and its joints."""
 
     name: str
-    instrument: InstrumentConstants
+    instrument: kinematics.InstrumentConstants
     joints: tuple[JointFigures, ...]
 
 
@@ -255,8 +248,8 @@ def judge(
         # Negated, so that a NaN margin counts as unreachable.
         unreachable_samples=int(np.count_nonzero(~(psm_a.margins >= -1e-9).all(axis=1))),
         least_margin=float(psm_a.margins.min()),
-        least_margin_joint=JOINTS[int(np.argmin(_lowest(psm_a.margins)))],
-        least_insertion_mm=float(psm_a.joints[:, INSERTION].min()),
+        least_margin_joint=kinematics.JOINTS[int(np.nan_to_num(psm_a.margins, nan=-np.inf).min(axis=0).argmin())],
+        least_insertion_mm=float(psm_a.joints[:, kinematics.INSERTION].min()),
         peak_speed_ratio=float(psm_a.speed.max()),
         peak_acceleration_ratio=float(psm_a.acceleration.max()),
         fk_error_mm=float(figures.fk_mm.max()),
@@ -363,8 +356,8 @@ def _check_same(playback: Playback, trajectory: Trajectory) -> None:
 
 def _arm_report(arm: ArmSamples) -> ArmFigures:
     rows = zip(
-        JOINTS,
-        UNITS,
+        kinematics.JOINTS,
+        kinematics.UNITS,
         arm.joints.min(axis=0).tolist(),
         arm.joints.max(axis=0).tolist(),
         arm.tool.lower.tolist(),
@@ -408,7 +401,7 @@ def _ends(
     playback: Playback, trajectory: Trajectory, figures: Figures, approach_m: ArrayLike | None
 ) -> tuple[PassEnd, ...]:
     last = trajectory.last_samples
-    jaws = matrix_of(trajectory.rotation_xyzw)
+    jaws = kinematics.matrix_of(trajectory.rotation_xyzw)
     approaches = _approaches(trajectory, approach_m)
     ends = []
     for number, end in enumerate(last.tolist()):
@@ -418,7 +411,7 @@ def _ends(
         ends.append(
             PassEnd(
                 sample=end,
-                turn_deg=float(np.degrees(angle_between(jaws[before][None], jaws[end][None])[0])),
+                turn_deg=float(np.degrees(kinematics.angle_between(jaws[before][None], jaws[end][None])[0])),
                 alignment_error_deg=float(figures.fk_deg[end]),
                 goal_error_mm=float(playback.tracking_mm[end]),
                 n_to_a_m_deg=to_n,
@@ -450,8 +443,3 @@ def _angles_deg(approach: Floats, jaw: Floats) -> tuple[float, float]:
 def _least(playback: Playback, other: str) -> float:
     columns = [k for k, pair in enumerate(playback.link_pairs) if pair.other == other]
     return float(playback.clearances_mm[:, columns].min())
-
-
-def _lowest(margins: Floats) -> Floats:
-    """Return each joint's least margin, with NaN as the least of all."""
-    return np.asarray(np.where(np.isnan(margins), -np.inf, margins).min(axis=0))

@@ -80,4 +80,4 @@ def test_one_demonstration_is_not_combined(trained: Service):
 
 def test_whoever_asks_may_choose_among_all_ways_that_there_are():
     asked = get_args(CombineIn.model_fields["kind"].annotation)
-    assert asked == get_args(policies.Combining) == get_args(get_type_hints(Combined)["kind"]) == tuple(COMBININGS)
+    assert asked == get_args(policies.Combining) == get_args(get_type_hints(Combined)["kind"]) == COMBININGS

@@ -165,7 +165,7 @@ def test_the_document_is_given_as_it_is_described(still: Service):
 
 def test_a_client_reads_answers_without_a_server_or_a_compiler():
     """The modules that the response models import determine how fast the command line starts."""
-    look = "import sys, skills.schemas.given; print(*{name.partition('.')[0] for name in sys.modules})"
+    look = "import sys, skills.schemas.responses; print(*{name.partition('.')[0] for name in sys.modules})"
     loaded = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout.split()
     assert not {"sqlalchemy", "fastapi", "starlette", "numba", "scipy", "sklearn", "orjson", "httpx2"} & {*loaded}
     assert {"pydantic", "numpy", "skills"} <= {*loaded}

@@ -132,7 +132,7 @@ def test_a_headline_is_good_only_if_the_stated_arm_error_allows_it(tmp_path: Pat
             headline = playback["headline"]
             assert playback["feasible"]
             [whole] = [
-                under["plan"] for under in playback["report"]["doubt"]["under"] if under["errors"] == asdict(errors)
+                under["plan"] for under in playback["report"]["estimate"]["under"] if under["errors"] == asdict(errors)
             ]
             assert (headline["probability"], headline["errors"]) == (whole, errors.name)
             assert headline["costs_most"] in headline["text"]

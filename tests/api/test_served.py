@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from sqlalchemy import text
 
-from skills.api.encoded_policies import NPZ, negotiate
-from skills.api.responses import JSON, Body
+from skills.api.encoded_policies import FORMATS, NPZ
+from skills.api.responses import JSON, Body, negotiate
 from skills.db.changes import APPLICATION, BOUND_S
 from skills.db.session import Database
 from skills.db.weighted_cache import WeightedCache
@@ -374,9 +374,9 @@ def test_a_client_that_wants_other_bytes_than_there_are_gets_none(trained: Servi
 def test_the_format_is_what_the_client_weighs_most(accept: str, given: str | None):
     if given is None:
         with pytest.raises(UnknownFormat):
-            negotiate(accept)
+            negotiate(accept, *FORMATS)
     else:
-        assert negotiate(accept) == given
+        assert negotiate(accept, *FORMATS) == given
 
 
 def test_a_cached_policy_is_not_given_to_whoever_may_not_see_it(trained: Service):

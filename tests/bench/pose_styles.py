@@ -7,7 +7,7 @@ at equal phase. DMP and ProMP are those of movement_primitives, the mixtures of 
 All but the straight line, the DMP and TP-GMM's positions learn from the demonstrations laid between start and goal.
 
 `SKILLS_TEST_JIGSAWS` names the folder of two tasks of JIGSAWS. Of each trial the longest hand-off is taken that is
-proposed for the right instrument; five of other surgeons, drawn by a seed, are shown for each.
+proposed for the left instrument; five of other surgeons, drawn by a seed, are shown for each.
 """
 
 import os
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 Poses = tuple[Floats, Floats]  # positions, (PHASES, 3), and unit quaternions, (PHASES, 4)
 Method = Callable[[list[Poses], Poses, Poses], Poses]  # demonstrations, their medoid, start and goal pose: a motion
 PHASE = np.linspace(0.0, 1.0, PHASES)
-RIGHT, COMBINED = "PSM_right", 5
+ARM, COMBINED = "PSM_left", 5
 
 
 def motions() -> dict[str, list[Poses]]:
@@ -59,10 +59,10 @@ def surgeons() -> dict[str, list[tuple[str, Poses]]]:
     """Return the hand-offs of each task of JIGSAWS with the letters of their surgeons, resampled in time, in mm."""
     found: dict[str, list[tuple[str, Poses]]] = {task: [] for task in TASKS.values()}
     for task, surgeon, _, recording in recordings():
-        longest = max(propose_segments(recording, RIGHT), key=lambda one: one.end_s - one.start_s, default=None)
+        longest = max(propose_segments(recording, ARM), key=lambda one: one.end_s - one.start_s, default=None)
         if longest is None:
             continue
-        demo = cut_demo(recording, arm=RIGHT, start_s=longest.start_s, end_s=longest.end_s)
+        demo = cut_demo(recording, arm=ARM, start_s=longest.start_s, end_s=longest.end_s)
         assert demo.rotation_xyzw is not None, "every row has an orientation"
         found[task].append((surgeon, _resampled(demo.tip_mm, Rotation.from_quat(demo.rotation_xyzw))))
     return found

@@ -17,9 +17,9 @@ from skills.client.client import AsyncClient
 from skills.client.problems import NotUnderstood
 from skills.errors import BadSettings, SkillsError
 from skills.formats.bag_writer import write_mcap
-from skills.schemas.given import Problem as ProblemDocument
 from skills.schemas.people import Surgeon
 from skills.schemas.policies import Policy
+from skills.schemas.responses import Problem as ProblemDocument
 from skills.settings import Settings
 from tests.client.peers import BOTH, SURGEON, Script, Time, answer, asked, at_once
 from tests.formats import bags
@@ -113,7 +113,8 @@ def test_type_checkers_know_what_both_clients_take_and_answer(tmp_path):
     file = tmp_path / "typed.py"
     file.write_text(
         "from typing import assert_type\n"
-        "from skills.schemas.given import Job, Policy\n"
+        "from skills.schemas.operation import Job\n"
+        "from skills.schemas.policies import Policy\n"
         "from skills.client import AsyncClient, Client\n"
         "def now(client: Client) -> None:\n"
         "    assert_type(client.policy('a', 'b', version=1), Policy)\n"

@@ -9,38 +9,24 @@ from math import log
 import numpy as np
 import pytest
 
+from skills.comparison import recognition
 from skills.comparison.distances import STATES
-from skills.comparison.recognition import (
-    FAMILIES,
-    NUMBERS,
-    MetricSettings,
-    Validated,
-    calibrate,
-    fit,
-    folds_of,
-    probabilities,
-    recognise,
-    signature_of,
-    usable,
-    validate,
-    vote,
-)
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput
 from skills.kinematics import matrix_of, quaternion_of
 from tests.comparison.cohort import Cohort, cohort
 from tests.needs import need
 
-TEMPO = MetricSettings(("tempo",), 0.1)
+TEMPO = recognition.MetricSettings(("tempo",), 0.1)
 
 
 def signatures(drawn: Cohort) -> np.ndarray:
-    return np.array([signature_of(demo) for demo in drawn.demos])
+    return np.array([recognition.signature_of(demo) for demo in drawn.demos])
 
 
-def validated(drawn: Cohort, surgeons: np.ndarray | None = None) -> Validated:
+def validated(drawn: Cohort, surgeons: np.ndarray | None = None) -> recognition.Validated:
     whose = drawn.surgeons if surgeons is None else surgeons
-    return validate(signatures(drawn), whose, drawn.sessions, np.arange(len(whose)))
+    return recognition.validate(signatures(drawn), whose, drawn.sessions, np.arange(len(whose)))
 
 
 def test_eight_surgeons_in_five_sessions_are_recognised():
@@ -91,10 +77,10 @@ def test_the_fitted_temperature_is_the_likeliest():
     rng = np.random.default_rng(4)
     away, truth = rng.uniform(1.0, 9.0, (200, 3)), rng.integers(0, 3, 200)
     away[np.arange(200), truth] -= 0.8
-    temperature, loss = calibrate(away, truth)
+    temperature, loss = recognition.calibrate(away, truth)
 
     def loss_of(of: float) -> float:
-        return -np.log(probabilities(away, of)[np.arange(200), truth]).mean()
+        return -np.log(recognition.probabilities(away, of)[np.arange(200), truth]).mean()
 
     assert loss == pytest.approx(loss_of(temperature))
     assert all(loss <= loss_of(temperature * factor) for factor in (0.5, 0.9, 0.99, 1.01, 1.1, 2.0))
@@ -110,7 +96,7 @@ def test_one_session_each_or_one_surgeon_is_refused():
 def test_copies_are_refused_for_the_median_distance_of_0():
     away = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 3.0]])  # the third demonstration is not the same
     with pytest.raises(BadInput, match="median distance") as refused:
-        calibrate(away, np.array([0, 1, 0]))
+        recognition.calibrate(away, np.array([0, 1, 0]))
     assert "All" not in str(refused.value)
     drawn = cohort(1, surgeons=2, sessions=3)
     with pytest.raises(BadInput, match="median distance"):
@@ -125,12 +111,12 @@ def test_recognition_of_an_untestable_demo_ignores_its_own_session():
     stranger = np.append(drawn.surgeons, 99)
     apart, together = np.append(drawn.sessions, 99), np.append(drawn.sessions, drawn.sessions[7])
     recordings, last = np.arange(len(stranger)), len(stranger) - 1
-    validated = validate(numbers, stranger, apart, recordings)
-    own, none = recognise(numbers, stranger, apart, recordings, last, validated)
+    validated = recognition.validate(numbers, stranger, apart, recordings)
+    own, none = recognition.recognise(numbers, stranger, apart, recordings, last, validated)
     assert own.argmax() == 1 and own[1] > 0.9
     assert own[-1] == 0.0  # that name occurs in no other session
     assert own.sum() == pytest.approx(1.0)
-    beside, none_beside = recognise(numbers, stranger, together, recordings, last, validated)
+    beside, none_beside = recognition.recognise(numbers, stranger, together, recordings, last, validated)
     assert beside[1] < own[1] and none_beside > none
 
 
@@ -139,8 +125,10 @@ def test_a_copy_under_another_name_hides_no_stranger():
     drawn = cohort(1)
     numbers = signatures(drawn)
     numbers = np.append(numbers, numbers[[7]], axis=0)
-    found = validate(numbers, np.append(drawn.surgeons, 99), np.append(drawn.sessions, 99), np.arange(len(numbers)))
-    without = validate(numbers[:-1], drawn.surgeons, drawn.sessions, np.arange(len(drawn.surgeons)))
+    found = recognition.validate(
+        numbers, np.append(drawn.surgeons, 99), np.append(drawn.sessions, 99), np.arange(len(numbers))
+    )
+    without = recognition.validate(numbers[:-1], drawn.surgeons, drawn.sessions, np.arange(len(drawn.surgeons)))
     assert found.stranger_fit[1] > 0.5 * without.stranger_fit[1] > 0.0
 
 
@@ -148,7 +136,7 @@ def test_one_that_was_tested_is_recognised_as_it_was():
     drawn = cohort(3)
     found = validated(drawn)
     given = signatures(drawn), drawn.surgeons, drawn.sessions, np.arange(40)
-    probability, none = recognise(*given, 12, found)
+    probability, none = recognition.recognise(*given, 12, found)
     assert (probability == found.probability[12]).all() and none == found.stranger[12]
     assert abs(found.sureness - found.accuracy) < 0.25
 
@@ -158,22 +146,24 @@ def test_the_metric_is_the_linear_discriminant_of_another_library():
 
     rng = np.random.default_rng(8)
     truth = np.repeat(np.arange(3), 40)
-    numbers = np.full((120, NUMBERS), np.nan)
+    numbers = np.full((120, recognition.NUMBERS), np.nan)
     mixed = rng.normal(size=(11, 11))
-    numbers[:, FAMILIES["tempo"]] = rng.normal(size=(120, 11)) @ mixed + 0.5 * truth[:, None] * rng.normal(size=11)
-    metric = fit(numbers, truth, 3, MetricSettings(("tempo",), 0.0))
-    known = numbers[:, FAMILIES["tempo"]]
+    numbers[:, recognition.FAMILIES["tempo"]] = rng.normal(size=(120, 11)) @ mixed + 0.5 * truth[:, None] * rng.normal(
+        size=11
+    )
+    metric = recognition.fit(numbers, truth, 3, recognition.MetricSettings(("tempo",), 0.0))
+    known = numbers[:, recognition.FAMILIES["tempo"]]
     theirs = LinearDiscriminantAnalysis(solver="lsqr", priors=np.full(3, 1 / 3)).fit(known, truth)
     # Theirs divides the covariance by N instead of N - S; ours counts the uncertainty of the means.
-    ours = probabilities(metric.away(numbers) * 41 / 40 * 120 / 117, 2.0)
+    ours = recognition.probabilities(metric.away(numbers) * 41 / 40 * 120 / 117, 2.0)
     np.testing.assert_allclose(ours, theirs.predict_proba(known), atol=1e-6)
 
 
 def test_the_metric_by_hand_and_a_constant_number_tells_nothing():
-    numbers = np.full((4, NUMBERS), np.nan)
-    numbers[:, FAMILIES["tempo"]] = 0.0
-    numbers[:, FAMILIES["tempo"].start] = [-1.0, 1.0, 9.0, 11.0]
-    metric = fit(numbers, np.array([0, 0, 1, 1]), 3, TEMPO)
+    numbers = np.full((4, recognition.NUMBERS), np.nan)
+    numbers[:, recognition.FAMILIES["tempo"]] = 0.0
+    numbers[:, recognition.FAMILIES["tempo"].start] = [-1.0, 1.0, 9.0, 11.0]
+    metric = recognition.fit(numbers, np.array([0, 0, 1, 1]), 3, TEMPO)
     away = metric.away(numbers)
     # One number varies by 2 within a surgeon (variance 4 / 2 = 2), ten do not; shrunk by 0.1 towards a mean of 2 / 11.
     np.testing.assert_allclose(away[0, :2], np.array([1.0, 11.0]) ** 2 * 2 / 3 / (0.9 * 2 + 0.1 * 2 / 11), rtol=1e-9)
@@ -190,26 +180,26 @@ def test_a_stranger_is_told_when_far_and_not_when_amid_the_others():
 
 
 def test_a_vote_adds_logarithms_and_no_single_one_rules_a_surgeon_out():
-    votes = vote(np.array([[0.6, 0.4, 0.0], [0.6, 0.4, 0.0], [0.0, 1.0, 0.0]]))
+    votes = recognition.vote(np.array([[0.6, 0.4, 0.0], [0.6, 0.4, 0.0], [0.0, 1.0, 0.0]]))
     assert votes.argmax() == 1
     np.testing.assert_allclose(votes[0], 2 * np.log(0.6) + np.log(1e-3))
 
 
 def test_sessions_of_a_surgeon_are_left_out_one_by_one_where_possible():
     truth, sessions = np.repeat([0, 1, 2], 8), np.tile(np.repeat(np.arange(4), 2), 3) + np.repeat([0, 4, 8], 8)
-    fold = folds_of(sessions, truth, 4)
+    fold = recognition.folds_of(sessions, truth, 4)
     assert {len(np.unique(fold[truth == one])) for one in range(3)} == {4}
     assert all(len(np.unique(fold[sessions == one])) == 1 for one in range(12))
-    assert len(np.unique(folds_of(sessions, truth, 99))) == 12
+    assert len(np.unique(recognition.folds_of(sessions, truth, 99))) == 12
 
 
 def test_only_families_that_all_have_are_compared_and_place_only_if_asked():
     numbers = signatures(cohort(1, surgeons=2, sessions=2))
-    assert usable(numbers) == [("shape",), ("shape", "tempo"), ("tempo",)]
-    assert usable(numbers, place=True)[0] == ("shape", "place")
-    full = np.zeros((2, NUMBERS))
-    assert usable(full)[-1] == ("shape", "tempo", "jaw", "turning", "orientation")
-    assert all("orientation" not in names for names in usable(full, one_frame=False))
+    assert recognition.usable(numbers) == [("shape",), ("shape", "tempo"), ("tempo",)]
+    assert recognition.usable(numbers, place=True)[0] == ("shape", "place")
+    full = np.zeros((2, recognition.NUMBERS))
+    assert recognition.usable(full)[-1] == ("shape", "tempo", "jaw", "turning", "orientation")
+    assert all("orientation" not in names for names in recognition.usable(full, one_frame=False))
     assert STATES > 0
 
 
@@ -226,11 +216,11 @@ def motion(rate_hz: float = 100.0) -> Demo:
 
 
 def family(demo: Demo, name: str) -> np.ndarray:
-    return signature_of(demo)[FAMILIES[name]]
+    return recognition.signature_of(demo)[recognition.FAMILIES[name]]
 
 
 def changed(one: Demo, other: Demo) -> set[str]:
-    return {name for name in FAMILIES if not np.allclose(family(one, name), family(other, name), atol=1e-6)}
+    return {name for name in recognition.FAMILIES if not np.allclose(family(one, name), family(other, name), atol=1e-6)}
 
 
 def test_each_change_changes_the_families_that_it_should():
@@ -243,13 +233,13 @@ def test_each_change_changes_the_families_that_it_should():
     assert changed(demo, replace(demo, rotation_xyzw=-demo.rotation_xyzw)) == set()
     slower = replace(demo, stamps_s=2 * demo.stamps_s)
     assert {"tempo"} <= changed(demo, slower)
-    assert FAMILIES["place"].stop == NUMBERS
+    assert recognition.FAMILIES["place"].stop == recognition.NUMBERS
 
 
 @pytest.mark.parametrize("rate_hz", [30.0, 200.0])
 def test_it_hardly_depends_on_the_sampling_rate(rate_hz: float):
-    demo, other = signature_of(motion()), signature_of(motion(rate_hz))
-    for name, part in FAMILIES.items():
+    demo, other = recognition.signature_of(motion()), recognition.signature_of(motion(rate_hz))
+    for name, part in recognition.FAMILIES.items():
         apart = np.abs(demo[part] - other[part])
         scale = 1.0 if name in ("shape", "place") else 0.05  # mm; logarithms, rad and cosines
         assert apart.max() < scale, (name, apart)
@@ -257,7 +247,9 @@ def test_it_hardly_depends_on_the_sampling_rate(rate_hz: float):
 
 def test_what_was_not_recorded_is_nan():
     bare = replace(motion(), rotation_xyzw=None, jaw_rad=None)
-    missing = {name for name, part in FAMILIES.items() if np.isnan(signature_of(bare)[part]).all()}
+    missing = {
+        name for name, part in recognition.FAMILIES.items() if np.isnan(recognition.signature_of(bare)[part]).all()
+    }
     assert missing == {"jaw", "turning", "orientation"}
     around = replace(bare, tip_mm=np.concatenate([bare.tip_mm[:150], bare.tip_mm[150::-1]]))
     assert np.isnan(family(around, "shape")).all() and np.isfinite(family(around, "tempo")).all()
@@ -265,8 +257,11 @@ def test_what_was_not_recorded_is_nan():
 
 def test_two_samples_a_nanosecond_apart_have_finite_numbers():
     short = Demo("PSM2", "/t", "PSM2_base", 0.0, 1e-9, np.array([0.0, 1e-9]), np.array([[0.0, 0, 0], [5.0, 0, 0]]))
-    numbers = signature_of(short)
-    assert np.isfinite(numbers[FAMILIES["tempo"]]).all() and np.isfinite(numbers[FAMILIES["place"]]).all()
+    numbers = recognition.signature_of(short)
+    assert (
+        np.isfinite(numbers[recognition.FAMILIES["tempo"]]).all()
+        and np.isfinite(numbers[recognition.FAMILIES["place"]]).all()
+    )
 
 
 @pytest.mark.nightly  # a minute of processor time

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, pass_times, seal
-from skills.formats.verify import JUDGED, check_bag
+from skills.formats.verify import JUDGED, verify_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
 from skills.planning.handoff import OtherArm
@@ -117,7 +117,7 @@ def arm(name: str = "PSM2") -> ArmMotion:
 
 def checked(files: dict[str, bytes]) -> list[str]:
     """Seal files with correct checksums and check them."""
-    return check_bag(io.BytesIO(seal(files)))
+    return verify_bag(io.BytesIO(seal(files)))
 
 
 def unpacked(tmp_path: Path, files: dict[str, bytes]) -> Path:

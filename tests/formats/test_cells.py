@@ -34,11 +34,9 @@ def both(text, used=(0, 1, 2), decimal="point", time=None):
     for quickly in (True, False):
         with open_text(io.BytesIO(text.encode())) as opened:
             names, separator = header_of(opened)
+            layout = cells.TableLayout(names, groups, separator, decimal, time)
             try:
-                if quickly:
-                    numbers = cells._plain_numbers(opened.buffer, len(names), groups, separator, decimal, time)
-                else:
-                    numbers = cells._any_numbers(opened, names, groups, separator, decimal, time)
+                numbers = cells._plain_numbers(opened.buffer, layout) if quickly else cells._any_numbers(opened, layout)
             except SkillsError as refused:
                 numbers = type(refused)
         said.append(numbers)
@@ -117,9 +115,10 @@ def test_the_quick_parser_starts_no_threads():
     """A reader's process may start none; Arrow's own reader of CSV files would."""
     code = (
         "import io, os, pyarrow\n"
-        "from skills.formats.cells import _plain_numbers\n"
+        "from skills.formats.cells import TableLayout, _plain_numbers\n"
         "before = len(os.listdir('/proc/self/task'))\n"
-        "read = _plain_numbers(io.BytesIO(b't,x\\n' + 1000 * b'1.5, 2.5\\n'), 2, ([0], [1]), ',', 'point', (0, 's'))\n"
+        "layout = TableLayout(['t', 'x'], ([0], [1]), time=(0, 's'))\n"
+        "read = _plain_numbers(io.BytesIO(b't,x\\n' + 1000 * b'1.5, 2.5\\n'), layout)\n"
         "assert read.rows == 1000\n"
         "print(len(os.listdir('/proc/self/task')) - before)\n"
     )

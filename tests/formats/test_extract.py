@@ -3,15 +3,7 @@ import io
 import numpy as np
 import pytest
 
-from skills.errors import (
-    BackwardStamps,
-    BadColumns,
-    BadSettings,
-    MixedFrames,
-    NotFinite,
-    NoUsableTopic,
-    UnreadableRecording,
-)
+from skills import errors
 from skills.formats import read_recording
 from tests.formats.bags import LOCAL, recording
 
@@ -55,16 +47,16 @@ def with_cell(row, column, value):
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [
-        (table(LINES, topic="/MTML/measured_cp"), NoUsableTopic, "/MTML/measured_cp"),
-        (table(LINES, kind="sensor_msgs/msg/JointState"), NoUsableTopic, "JointState"),
-        (table(LINES, fields=FIELDS[1:]), BadColumns, "frame_id"),
-        (table(LINES, fields=[*FIELDS, FIELDS[0]]), BadColumns, "frame_id"),
-        (table([]), UnreadableRecording, "no rows"),
-        (table(with_cell(3, 8, "far")), UnreadableRecording, "Row 7"),
-        (table([*LINES[:3], LINES[3][:5]]), UnreadableRecording, "Row 7"),
-        (table(with_cell(3, 8, "nan")), NotFinite, LOCAL),
-        (table(with_cell(3, 1, "ECM")), MixedFrames, "2 frames"),
-        (table(with_cell(3, 3, 17)), BackwardStamps, LOCAL),
+        (table(LINES, topic="/MTML/measured_cp"), errors.NoUsableTopic, "/MTML/measured_cp"),
+        (table(LINES, kind="sensor_msgs/msg/JointState"), errors.NoUsableTopic, "JointState"),
+        (table(LINES, fields=FIELDS[1:]), errors.BadColumns, "frame_id"),
+        (table(LINES, fields=[*FIELDS, FIELDS[0]]), errors.BadColumns, "frame_id"),
+        (table([]), errors.UnreadableRecording, "no rows"),
+        (table(with_cell(3, 8, "far")), errors.UnreadableRecording, "Row 7"),
+        (table([*LINES[:3], LINES[3][:5]]), errors.UnreadableRecording, "Row 7"),
+        (table(with_cell(3, 8, "nan")), errors.NotFinite, LOCAL),
+        (table(with_cell(3, 1, "ECM")), errors.MixedFrames, "2 frames"),
+        (table(with_cell(3, 3, 17)), errors.BackwardStamps, LOCAL),
     ],
 )
 def test_a_table_that_cannot_be_meant_is_refused(text, error, message):
@@ -73,7 +65,7 @@ def test_a_table_that_cannot_be_meant_is_refused(text, error, message):
 
 
 def test_neither_a_rate_nor_another_frame_is_taken():
-    with pytest.raises(BadSettings):
+    with pytest.raises(errors.BadSettings):
         read(table(LINES), rate_hz=100.0)
-    with pytest.raises(MixedFrames, match="PSM2_base"):
+    with pytest.raises(errors.MixedFrames, match="PSM2_base"):
         read(table(LINES), frame="ECM")

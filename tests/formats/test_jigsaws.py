@@ -7,7 +7,7 @@ from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.recording import Label
 from skills.errors import BadSettings, MixedFrames, NotAQuaternion, NotFinite, NotMetres, UnreadableRecording
 from skills.formats import read_recording
-from skills.formats.jigsaws import RATE_HZ, RatedTrial, meta_line, read_meta, trials
+from skills.formats.jigsaws import HEADER, RATE_HZ, RatedTrial, meta_line, read_meta, trials
 from tests.formats.others import zipped
 from tests.formats.trials import GESTURES, META, folder, kinematics, text, turning
 
@@ -32,14 +32,55 @@ def test_each_arm_is_read_from_its_own_columns():
     table = np.array([[float(cell) for cell in row.split()] for row in text(kinematics()).splitlines()])
     got = read(text(kinematics()))
     assert (got.format, got.integrity, got.arms) == ("jigsaws", "none", ("PSM_left", "PSM_right"))
-    for motion, jaw, first in ((got.motions[0], got.jaws[0][1], 38), (got.motions[1], got.jaws[1][1], 57)):
+    for motion, jaw, first in ((got.motions[0], got.jaws[0][1], 57), (got.motions[1], got.jaws[1][1], 38)):
         np.testing.assert_array_equal(motion.tip_mm, 1000.0 * table[:, first : first + 3])
         np.testing.assert_allclose(matrices(motion.rotation_xyzw), table[:, first + 3 : first + 12], rtol=0, atol=2e-6)
         np.testing.assert_array_equal(jaw.values, table[:, first + 18])
-    assert [motion.topic for motion in got.motions] == ["columns 39-57", "columns 58-76"]
+    assert [motion.topic for motion in got.motions] == ["columns 58-76", "columns 39-57"]
     assert [motion.arm for motion in got.masters] == ["MTML", "MTMR"]
     np.testing.assert_array_equal(got.masters[1].tip_mm, 1000.0 * table[:, 19:22])
     np.testing.assert_array_equal(dict(got.grippers)["MTML"].values, table[:, 18])
+
+
+def driven(crossed: bool = True) -> np.ndarray:
+    """Return a trial in which each master moves in its own rhythm, and the instruments as the masters do."""
+    table, rng = kinematics(), np.random.default_rng(3)
+    steps = [np.cumsum(rng.uniform(0, 1e-3, 300)) for _ in range(2)]
+    for first, side in ((0, 0), (19, 1), (38, int(crossed)), (57, int(not crossed))):
+        table[:, first : first + 3] = (0.01, 0.05, -0.10)
+        table[:, first] += steps[side] * (1.0 if first < 38 else 0.5)
+    return table
+
+
+def test_the_left_master_drives_the_left_instrument():
+    got = read(text(driven()))
+    steps = {motion.arm: np.diff(motion.tip_mm[:, 0]) for motion in (*got.motions, *got.masters)}
+    assert np.corrcoef(steps["MTML"], steps["PSM_left"])[0, 1] > 0.99
+    assert np.corrcoef(steps["MTMR"], steps["PSM_right"])[0, 1] > 0.99
+
+
+def test_a_trial_with_exchanged_instruments_is_refused():
+    message = r"MTML moves as columns 39-57 do \(correlation of speeds 1\.00\), not as columns 58-76"
+    with pytest.raises(UnreadableRecording, match=message):
+        read(text(driven(crossed=False)))
+
+
+def with_names(data: bytes) -> bytes:
+    """Return kinematics as the comma-separated copy has them."""
+    return "\n".join([HEADER, *(",".join(row.split()) for row in data.decode().splitlines()), ""]).encode()
+
+
+def test_the_comma_separated_copy_is_the_same_recording():
+    data = text(driven())
+    mine, theirs = read(data), read(with_names(data))
+    assert theirs.format == "jigsaws"
+    for one, other in zip((*mine.motions, *mine.masters), (*theirs.motions, *theirs.masters), strict=True):
+        np.testing.assert_array_equal(one.tip_mm, other.tip_mm)
+        np.testing.assert_array_equal(one.rotation_xyzw, other.rotation_xyzw)
+    lines = with_names(data).split(b"\n")
+    lines[2] = lines[2].replace(b",", b",x", 1)
+    with pytest.raises(UnreadableRecording, match=r"Row 3, column 2: not a number\."):
+        read(b"\n".join(lines))
 
 
 def test_rows_are_a_thirtieth_of_a_second_apart_and_never_drift():
@@ -61,7 +102,7 @@ def test_any_rotation_becomes_the_quaternion_that_turns_alike(seed):
     turns[:4] = np.eye(4)  # half turns about each axis, and the identity
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     table = kinematics(200)
-    table[:, 60:69] = matrices(turns)
+    table[:, 41:50] = matrices(turns)
     data = "\n".join(" ".join(repr(float(value)) for value in row) for row in table).encode()
     got = read(data).motion_of(arm="PSM_right").rotation_xyzw
     np.testing.assert_allclose(matrices(got), matrices(turns), rtol=0, atol=1e-12)
@@ -115,7 +156,7 @@ def changed(row, column, value):
         (changed(7, 40, "nan"), NotFinite, "Row 7, column 40"),
         (changed(7, 52, "inf"), NotFinite, "Row 7, column 52"),
         (changed(7, 40, "55.0"), NotMetres, "55 m"),
-        (changed(7, 42, "2.0"), NotAQuaternion, "Row 7: the matrix of PSM_left"),
+        (changed(7, 42, "2.0"), NotAQuaternion, "Row 7: the matrix of PSM_right"),
         (text(np.hstack([kinematics(5)[:, 10:], kinematics(5)[:, :10]])), NotAQuaternion, "order of JIGSAWS"),
     ],
 )

@@ -10,19 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from skills.errors import (
-    BackwardStamps,
-    BadColumns,
-    BadInput,
-    MixedFrames,
-    NotAQuaternion,
-    NotFinite,
-    NotMetres,
-    NoUsableTopic,
-    SkillsError,
-    UnknownFormat,
-    UnreadableRecording,
-)
+from skills import errors
 from skills.formats import read_recording
 from skills.formats.lerobot.cut import choose_episodes, cut_episode, episodes_of, find_dataset
 from skills.kinematics import forward, quaternion_of
@@ -82,7 +70,7 @@ def test_a_dataset_of_v3_with_one_episode_is_read():
 
 
 def test_poses_without_a_frame_are_refused_in_the_words_of_each_door():
-    with pytest.raises(BadColumns, match="does not say in which frame") as refused:
+    with pytest.raises(errors.BadColumns, match="does not say in which frame") as refused:
         read(episode(), frame=None)
     assert "--frame ECM" in refused.value.words(Door.COMMAND)
     assert "frame=ECM" in refused.value.words(Door.HTTP)
@@ -94,7 +82,7 @@ def test_the_base_of_each_arm_can_be_stated_as_the_frame():
 
 def test_a_frame_that_no_pose_is_in_is_refused():
     columns, names = lerobots.joint_columns([f"PSM1_joint_{k}" for k in range(1, 7)] + ["PSM1_jaw"])
-    with pytest.raises(MixedFrames, match="the frames are PSM1_base"):
+    with pytest.raises(errors.MixedFrames, match="the frames are PSM1_base"):
         read(episode(columns, names=names), "ECM")
 
 
@@ -124,7 +112,7 @@ def test_joints_become_poses_with_the_instrument_that_the_dataset_names(names):
 
 def test_joints_of_an_unknown_instrument_need_one_to_be_stated():
     columns, names = lerobots.joint_columns([*(f"PSM2_joint_{k}" for k in range(1, 7)), "PSM2_jaw"])
-    with pytest.raises(BadColumns, match="without the number of the instrument"):
+    with pytest.raises(errors.BadColumns, match="without the number of the instrument"):
         read(episode(columns, names=names), None)
     stated = read(episode(columns, names=names, said={"tools": {"PSM2": "420006"}}), None)
     assert stated.motions[0].frame == "PSM2_base"
@@ -133,7 +121,7 @@ def test_joints_of_an_unknown_instrument_need_one_to_be_stated():
 
 def test_an_instrument_other_than_the_one_of_the_dataset_is_refused():
     columns, names = lerobots.joint_columns([*(f"PSM1_joint_{k}" for k in range(1, 7)), "PSM1_jaw"])
-    with pytest.raises(BadColumns, match="stated as 420006, and the dataset names 400006"):
+    with pytest.raises(errors.BadColumns, match="stated as 420006, and the dataset names 400006"):
         read(episode(columns, names=names, said={"tools": {"PSM1": "420006"}}), None)
 
 
@@ -194,7 +182,7 @@ def test_tools_of_both_arms_in_one_feature_are_read():
 
 def test_columns_without_names_are_read_as_the_user_states():
     nameless = {"observation.state": [f"motor_{k}" for k in range(16)]}
-    with pytest.raises(NoUsableTopic, match="motor_0, motor_1"):
+    with pytest.raises(errors.NoUsableTopic, match="motor_0, motor_1"):
         read(episode(names=nameless))
     columns = {name: f"observation.state[{k}]" for k, name in enumerate(STATE)}
     stated = read(episode(names=nameless, said={"columns": columns}))
@@ -214,13 +202,13 @@ def test_columns_without_names_are_read_as_the_user_states():
 )
 def test_wrong_statements_are_refused(columns, words):
     nameless = {"observation.state": [f"motor_{k}" for k in range(16)]}
-    with pytest.raises(BadColumns, match=words):
+    with pytest.raises(errors.BadColumns, match=words):
         read(episode(names=nameless, said={"columns": columns}))
 
 
 def test_two_columns_of_one_meaning_are_refused_until_one_is_stated():
     files = columns_of(40, **{"observation.state.psm1.gripper": poses(40)[:, 0]})
-    with pytest.raises(BadColumns, match="Two columns"):
+    with pytest.raises(errors.BadColumns, match="Two columns"):
         read(episode(files))
     stated = read(episode(files, said={"columns": {"psm1_jaw": "observation.state[7]"}}))
     np.testing.assert_array_equal(stated.jaw_of("PSM1").values, poses(40)[:, 7].astype(np.float64))
@@ -228,7 +216,7 @@ def test_two_columns_of_one_meaning_are_refused_until_one_is_stated():
 
 def test_a_pose_with_a_part_of_an_orientation_is_refused():
     names = [name.replace("psm1_pose.orientation.w", "w") for name in STATE]
-    with pytest.raises(BadColumns, match=r"no column orientation\.w"):
+    with pytest.raises(errors.BadColumns, match=r"no column orientation\.w"):
         read(episode(names={"observation.state": names}))
 
 
@@ -269,12 +257,12 @@ def test_double_precision_and_left_out_frames_keep_their_times():
 @pytest.mark.parametrize(
     ("more", "error"),
     [
-        ({"frame_index": np.arange(40)[::-1].copy()}, BackwardStamps),
-        ({"frame_index": np.zeros(40, dtype=np.int64)}, BackwardStamps),
-        ({"frame_index": np.arange(40) - 1}, UnreadableRecording),
-        ({"timestamp": np.where(np.arange(40) == 3, np.nan, np.arange(40) / FPS)}, NotFinite),
-        ({"timestamp": np.arange(40)[::-1] / FPS}, BackwardStamps),
-        ({"timestamp": np.arange(40) * 1e12}, UnreadableRecording),
+        ({"frame_index": np.arange(40)[::-1].copy()}, errors.BackwardStamps),
+        ({"frame_index": np.zeros(40, dtype=np.int64)}, errors.BackwardStamps),
+        ({"frame_index": np.arange(40) - 1}, errors.UnreadableRecording),
+        ({"timestamp": np.where(np.arange(40) == 3, np.nan, np.arange(40) / FPS)}, errors.NotFinite),
+        ({"timestamp": np.arange(40)[::-1] / FPS}, errors.BackwardStamps),
+        ({"timestamp": np.arange(40) * 1e12}, errors.UnreadableRecording),
     ],
     ids=["backwards", "one number", "negative", "NaN", "timestamps backwards", "nanoseconds"],
 )
@@ -289,10 +277,10 @@ def test_frames_out_of_order_are_refused(more, error):
 @pytest.mark.parametrize(
     ("change", "error"),
     [
-        (lambda state: state.__setitem__((3, 1), np.nan), NotFinite),
-        (lambda state: state.__setitem__((3, 7), np.inf), NotFinite),
-        (lambda state: state.__setitem__((slice(None), slice(0, 3)), 50.0), NotMetres),
-        (lambda state: state.__setitem__((5, 6), 3.0), NotAQuaternion),
+        (lambda state: state.__setitem__((3, 1), np.nan), errors.NotFinite),
+        (lambda state: state.__setitem__((3, 7), np.inf), errors.NotFinite),
+        (lambda state: state.__setitem__((slice(None), slice(0, 3)), 50.0), errors.NotMetres),
+        (lambda state: state.__setitem__((5, 6), 3.0), errors.NotAQuaternion),
     ],
     ids=["NaN", "an infinite jaw", "millimetres", "no quaternion"],
 )
@@ -306,7 +294,7 @@ def test_impossible_numbers_are_refused(change, error):
 def test_a_tip_that_never_leaves_the_cannula_is_refused():
     state = poses(40)
     state[:, [0, 1, 2, 8, 9, 10]] *= 0.1
-    with pytest.raises(NotMetres, match="inside the cannula"):
+    with pytest.raises(errors.NotMetres, match="inside the cannula"):
         read(episode(columns_of(40, **{"observation.state": state})), "base")
 
 
@@ -324,12 +312,12 @@ def test_a_tip_that_never_leaves_the_cannula_is_refused():
     ],
 )
 def test_gaps_and_other_types_are_refused(column, values):
-    with pytest.raises(UnreadableRecording, match=r"does not have \d+ (numbers|texts) in every row"):
+    with pytest.raises(errors.UnreadableRecording, match=r"does not have \d+ (numbers|texts) in every row"):
         read(episode(data=lerobots.parquet(columns_of(40) | {column: values})))
 
 
 def test_a_tool_that_changes_within_an_episode_is_refused():
-    with pytest.raises(UnreadableRecording, match="tool of PSM1 changes"):
+    with pytest.raises(errors.UnreadableRecording, match="tool of PSM1 changes"):
         read(episode(columns_of(2, **{"observation.meta.tool.psm1": ["a", "b"]})))
 
 
@@ -351,12 +339,12 @@ def test_a_tool_that_changes_within_an_episode_is_refused():
     ],
 )
 def test_a_dataset_that_contradicts_itself_is_refused(files, words):
-    with pytest.raises(UnreadableRecording, match=words):
+    with pytest.raises(errors.UnreadableRecording, match=words):
         read(files)
 
 
 def test_a_parquet_file_alone_is_refused_with_the_remedy():
-    with pytest.raises(UnknownFormat, match=r"send an episode with its meta/info\.json"):
+    with pytest.raises(errors.UnknownFormat, match=r"send an episode with its meta/info\.json"):
         read_recording(io.BytesIO(lerobots.parquet(columns_of(4))))
 
 
@@ -365,14 +353,14 @@ def test_a_parquet_file_alone_is_refused_with_the_remedy():
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_several_episodes_are_refused_with_their_number(version):
-    with pytest.raises(UnreadableRecording, match=r"has 3 episodes\. A recording is one of them") as refused:
+    with pytest.raises(errors.UnreadableRecording, match=r"has 3 episodes\. A recording is one of them") as refused:
         read(dataset(version))
     assert "--episode" in refused.value.words(Door.COMMAND)
 
 
 def test_several_episodes_in_one_file_are_refused():
     columns = columns_of(40, episode_index=np.arange(40) // 20)
-    with pytest.raises(UnreadableRecording, match="has 2 episodes"):
+    with pytest.raises(errors.UnreadableRecording, match="has 2 episodes"):
         read(episode(columns, total_episodes=2))
 
 
@@ -435,25 +423,25 @@ def test_pictures_within_the_data_are_not_cut_out(tmp_path):
 
 @pytest.mark.parametrize("which", ["3", "-1", "x", "99999999999999999999", ""])
 def test_an_episode_that_is_not_there_is_refused_with_those_that_are(tmp_path, which):
-    with find_dataset(write(dataset("v2.1"), tmp_path)) as found, pytest.raises(BadInput, match="it has 0 to 2"):
+    with find_dataset(write(dataset("v2.1"), tmp_path)) as found, pytest.raises(errors.BadInput, match="it has 0 to 2"):
         choose_episodes(found, which)
 
 
 def test_rows_of_another_episode_are_refused(tmp_path):
     files = dataset("v2.1")
     files["data/chunk-000/episode_000001.parquet"] = files["data/chunk-000/episode_000002.parquet"]
-    with pytest.raises(UnreadableRecording, match="are of other episodes"):
+    with pytest.raises(errors.UnreadableRecording, match="are of other episodes"):
         cut(write(files, tmp_path), 1)
 
 
 def test_places_of_episodes_that_do_not_fit_the_files_are_refused(tmp_path):
     files = dataset("v3.0")
     del files["data/chunk-000/file-001.parquet"]
-    with pytest.raises(UnreadableRecording, match="has no file 1 in chunk 0"):
+    with pytest.raises(errors.UnreadableRecording, match="has no file 1 in chunk 0"):
         cut(write(files, tmp_path), 0)
     short = dataset("v3.0")
     short["data/chunk-000/file-000.parquet"] = lerobots.parquet(columns_of(40))
-    with pytest.raises(UnreadableRecording, match="has 0 of 50 rows"):
+    with pytest.raises(errors.UnreadableRecording, match="has 0 of 50 rows"):
         cut(write(short, tmp_path / "short"), 1)
 
 
@@ -466,5 +454,5 @@ def test_every_refusal_is_one_of_ours(tmp_path):
     with find_dataset(tmp_path) as found:
         assert found is None
     (tmp_path / "empty.zip").write_bytes(b"PK\x03\x04")
-    with pytest.raises(SkillsError), find_dataset(tmp_path / "empty.zip"):
+    with pytest.raises(errors.SkillsError), find_dataset(tmp_path / "empty.zip"):
         pass

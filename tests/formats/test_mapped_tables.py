@@ -5,17 +5,8 @@ import io
 import numpy as np
 import pytest
 
+from skills import errors
 from skills.demonstration.recording import Column
-from skills.errors import (
-    BackwardStamps,
-    BadColumns,
-    BadSettings,
-    MixedFrames,
-    NotAQuaternion,
-    NotMetres,
-    NoUsableTopic,
-    UnreadableRecording,
-)
 from skills.formats import read_recording
 from skills.kinematics import INSERTION, INSTRUMENTS, angle_between, forward, matrix_of
 from tests.formats import written
@@ -47,7 +38,7 @@ def test_columns_are_read_under_the_names_that_the_caller_gives(separator):
 
 def test_positions_under_other_names_need_a_frame():
     how = {"column": XYZ, "unit": ["mm"], "rate_hz": 100.0}
-    with pytest.raises(BadColumns, match="in which frame its positions are"):
+    with pytest.raises(errors.BadColumns, match="in which frame its positions are"):
         read(written.positions(), **how, frame=None)
     assert read(written.positions(), **how, frame="ECM").motion_of().frame == "ECM"
     assert read("t_s,x_mm,y_mm,z_mm\n0,0,50,-120\n1,1,50,-120\n").motion_of().frame == "PSM_base"
@@ -58,14 +49,14 @@ def test_decimal_commas_are_read_if_stated_and_questioned_otherwise(separator):
     text = written.positions(separator=separator, comma=True)
     how = {"column": XYZ, "unit": ["mm"], "rate_hz": 100.0}
     np.testing.assert_array_equal(read(text, **how, decimal="comma").motion_of().tip_mm, wanted())
-    with pytest.raises(UnreadableRecording, match="is it the decimal mark"):
+    with pytest.raises(errors.UnreadableRecording, match="is it the decimal mark"):
         read(text, **how)
 
 
 @pytest.mark.parametrize("cell", ["1.234,5", "1,234,567", "1.5"])
 def test_a_point_beside_decimal_commas_is_refused(cell):
     text = f"t_ms;x_mm;y_mm;z_mm\n0;1,5;50;-120\n10;{cell};50;-120\n"
-    with pytest.raises(UnreadableRecording, match="Row 3, column x_mm"):
+    with pytest.raises(errors.UnreadableRecording, match="Row 3, column x_mm"):
         read(text, decimal="comma")
 
 
@@ -80,9 +71,9 @@ def test_nanoseconds_are_exact_and_times_of_another_unit_questioned():
     times = [1760000000123456789, 1760000000133456790]
     text = "t_ns,x_m,y_m,z_m\n" + "".join(f"{t},0,0,-0.1\n" for t in times)
     assert read(text).motion_of().stamps_ns.tolist() == times
-    with pytest.raises(BadColumns, match="in which unit are they"):
+    with pytest.raises(errors.BadColumns, match="in which unit are they"):
         read("Time;x_mm;y_mm;z_mm\n" + ROWS, column=["t_ns=Time"])
-    with pytest.raises(BadColumns, match="after the year 2096; give milliseconds"):
+    with pytest.raises(errors.BadColumns, match="after the year 2096; give milliseconds"):
         read(text.replace("t_ns", "t_ms"))
 
 
@@ -107,20 +98,20 @@ HEAD = "Time;PosX;PosY;PosZ\n"
 @pytest.mark.parametrize(
     ("how", "error", "question"),
     [
-        ({"column": XYZ, "rate_hz": 100.0}, BadSettings, "In which unit is the column 'PosX'"),
-        ({"column": ["x_m=PosX", *XYZ[1:]], "unit": ["mm"], "rate_hz": 1.0}, BadSettings, "which is it"),
-        ({"column": XYZ, "unit": ["mm", "m"], "rate_hz": 1.0}, BadSettings, "contradict"),
-        ({"column": XYZ, "unit": ["mm", "deg"], "rate_hz": 1.0}, BadSettings, "belongs to no mapped column"),
-        ({"column": XYZ, "unit": ["inch"], "rate_hz": 1.0}, BadSettings, "unit 'inch' is unknown"),
-        ({"column": [*XYZ, "x=PosY"], "unit": ["mm"], "rate_hz": 1.0}, BadSettings, "second time"),
-        ({"column": [*XYZ, "qx=PosY"], "unit": ["mm"], "rate_hz": 1.0}, BadSettings, "second time"),
-        ({"column": [*XYZ[:2], "z=Posz"], "unit": ["mm"], "rate_hz": 1.0}, BadColumns, "Did you mean 'PosZ'"),
-        ({"column": ["PosX"], "rate_hz": 1.0}, BadSettings, "not of the form"),
-        ({"column": ["w=PosX"], "rate_hz": 1.0}, BadSettings, "not of the form"),
-        ({"column": XYZ[:2], "unit": ["mm"], "rate_hz": 1.0}, BadColumns, "z_mm is missing"),
-        ({"column": [*XYZ, "t_ms=Time"], "unit": ["mm"], "rate_hz": 1.0}, BadColumns, "use one of them"),
-        ({"column": XYZ, "unit": ["mm"]}, BadColumns, "no column t_s"),
-        ({"unit": ["mm"]}, BadColumns, "unknown column 'Time'"),
+        ({"column": XYZ, "rate_hz": 100.0}, errors.BadSettings, "In which unit is the column 'PosX'"),
+        ({"column": ["x_m=PosX", *XYZ[1:]], "unit": ["mm"], "rate_hz": 1.0}, errors.BadSettings, "which is it"),
+        ({"column": XYZ, "unit": ["mm", "m"], "rate_hz": 1.0}, errors.BadSettings, "contradict"),
+        ({"column": XYZ, "unit": ["mm", "deg"], "rate_hz": 1.0}, errors.BadSettings, "belongs to no mapped column"),
+        ({"column": XYZ, "unit": ["inch"], "rate_hz": 1.0}, errors.BadSettings, "unit 'inch' is unknown"),
+        ({"column": [*XYZ, "x=PosY"], "unit": ["mm"], "rate_hz": 1.0}, errors.BadSettings, "second time"),
+        ({"column": [*XYZ, "qx=PosY"], "unit": ["mm"], "rate_hz": 1.0}, errors.BadSettings, "second time"),
+        ({"column": [*XYZ[:2], "z=Posz"], "unit": ["mm"], "rate_hz": 1.0}, errors.BadColumns, "Did you mean 'PosZ'"),
+        ({"column": ["PosX"], "rate_hz": 1.0}, errors.BadSettings, "not of the form"),
+        ({"column": ["w=PosX"], "rate_hz": 1.0}, errors.BadSettings, "not of the form"),
+        ({"column": XYZ[:2], "unit": ["mm"], "rate_hz": 1.0}, errors.BadColumns, "z_mm is missing"),
+        ({"column": [*XYZ, "t_ms=Time"], "unit": ["mm"], "rate_hz": 1.0}, errors.BadColumns, "use one of them"),
+        ({"column": XYZ, "unit": ["mm"]}, errors.BadColumns, "no column t_s"),
+        ({"unit": ["mm"]}, errors.BadColumns, "unknown column 'Time'"),
         ({"column": XYZ, "unit": ["mm"], "rate_hz": 1.0, "instrument": "1"}, Exception, "instrument '1' is unknown"),
     ],
 )
@@ -132,13 +123,13 @@ def test_what_is_ambiguous_is_refused_with_the_question(how, error, question):
 @pytest.mark.parametrize(
     ("text", "how", "error", "message"),
     [
-        ("x_mm;y_mm,z_mm\n1;2,3\n", {"rate_hz": 1.0}, BadColumns, "both commas and semicolons"),
-        ("x_mm,a,a\n1,2,3\n", {"column": ["y_mm=a"], "rate_hz": 1.0}, BadColumns, "'a' twice"),
-        ("t_s,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad\n0,0,0,-100,0,0,90\n", {}, NotAQuaternion, "more than a turn"),
-        ("t_s,x_mm,y_mm,z_mm,rx_rad,ry_rad\n0,0,0,-100,0,0\n", {}, BadColumns, "rz_rad is missing"),
-        ("t_s,q1_rad,q2_rad,q3_m\n0,0,0,0.1\n", {}, BadColumns, "q4_rad is missing"),
-        ("t_s;x_mm;y_mm;z_mm\n0;1;2;3;4\n", {}, UnreadableRecording, "Row 2 has 5 cells"),
-        ("t_s;x_mm;y_mm;z_mm\n0;1;2;np.float64(3\n", {}, UnreadableRecording, "column z_mm: not a number"),
+        ("x_mm;y_mm,z_mm\n1;2,3\n", {"rate_hz": 1.0}, errors.BadColumns, "both commas and semicolons"),
+        ("x_mm,a,a\n1,2,3\n", {"column": ["y_mm=a"], "rate_hz": 1.0}, errors.BadColumns, "'a' twice"),
+        ("t_s,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad\n0,0,0,-100,0,0,90\n", {}, errors.NotAQuaternion, "more than a turn"),
+        ("t_s,x_mm,y_mm,z_mm,rx_rad,ry_rad\n0,0,0,-100,0,0\n", {}, errors.BadColumns, "rz_rad is missing"),
+        ("t_s,q1_rad,q2_rad,q3_m\n0,0,0,0.1\n", {}, errors.BadColumns, "q4_rad is missing"),
+        ("t_s;x_mm;y_mm;z_mm\n0;1;2;3;4\n", {}, errors.UnreadableRecording, "Row 2 has 5 cells"),
+        ("t_s;x_mm;y_mm;z_mm\n0;1;2;np.float64(3\n", {}, errors.UnreadableRecording, "column z_mm: not a number"),
     ],
 )
 def test_a_table_that_cannot_be_meant_is_refused(text, how, error, message):
@@ -149,7 +140,7 @@ def test_a_table_that_cannot_be_meant_is_refused(text, how, error, message):
 @pytest.mark.parametrize("option", [{"column": ["x_mm=a"]}, {"unit": ["mm"]}, {"table_arm": "PSM1"}])
 def test_a_bag_takes_no_option_of_a_table(option):
     bag = (sample_folder() / "old_transform_stamped.mcap").read_bytes()
-    with pytest.raises(BadSettings, match=f"omit {next(iter(option))}"):
+    with pytest.raises(errors.BadSettings, match=f"omit {next(iter(option))}"):
         read_recording(io.BytesIO(bag), **option)
 
 
@@ -159,7 +150,7 @@ def test_quoted_names_may_contain_separators_and_stamps_go_back():
     column = [f"{axis}_mm=Pos {axis.upper()}, mm" for axis in "xyz"]
     motion = read(text, column=column).motion_of()
     assert (motion.backward_stamps, len(motion.stamps_ns)) == (1, 199)
-    with pytest.raises(BackwardStamps):
+    with pytest.raises(errors.BackwardStamps):
         read("t_s,x_mm,y_mm,z_mm\n0,1,50,-120\n1,1,50,-120\n0.99,1,50,-120\n")
 
 
@@ -168,7 +159,7 @@ def test_quoted_names_may_contain_separators_and_stamps_go_back():
 
 def test_joints_alone_become_poses_with_a_stated_instrument():
     text = written.joints()
-    with pytest.raises(NoUsableTopic, match="the instrument that was on the arm"):
+    with pytest.raises(errors.NoUsableTopic, match="the instrument that was on the arm"):
         read(text, rate_hz=30.0)
     recording = read(text, rate_hz=30.0, instrument="400006", table_arm="PSM2")
     (joints,), motion = recording.joints, recording.motion_of()
@@ -178,7 +169,7 @@ def test_joints_alone_become_poses_with_a_stated_instrument():
     assert (motion.frame, joints.arm, recording.tools) == ("PSM2_base", "PSM2", (("PSM2", "400006"),))
     assert recording.identifications == ()  # the poses were computed from the joints, and show nothing about them
     assert recording.instrument_on("PSM2") == "400006"
-    with pytest.raises(MixedFrames, match="PSM2_base"):
+    with pytest.raises(errors.MixedFrames, match="PSM2_base"):
         read(text, rate_hz=30.0, instrument="400006", table_arm="PSM2", frame="ECM")
 
 
@@ -188,13 +179,13 @@ def test_joints_in_other_units_are_refused_or_named():
     degrees = np.loadtxt(io.StringIO(rows), delimiter=",")
     degrees[:, [0, 1, 3, 4, 5]] *= 180 / np.pi
     rows = "\n".join(",".join(map(repr, row)) for row in degrees.tolist())
-    with pytest.raises(NotMetres, match="no joint of a PSM is"):
+    with pytest.raises(errors.NotMetres, match="no joint of a PSM is"):
         read(f"{head}\n{rows}", rate_hz=30.0, instrument="400006")
     named = read(f"{head.replace('rad', 'deg')}\n{rows}", rate_hz=30.0, instrument="400006")
     np.testing.assert_allclose(
         named.motion_of().tip_mm, read(text, rate_hz=30.0, instrument="400006").motion_of().tip_mm, atol=1e-9
     )
-    with pytest.raises(NotMetres, match="inside the cannula"):
+    with pytest.raises(errors.NotMetres, match="inside the cannula"):
         read(
             text.replace("q3_m", "q3_mm"), rate_hz=30.0, instrument="400006", column=["q1_rad=q2_rad", "q2_rad=q1_rad"]
         )
@@ -206,7 +197,7 @@ def test_joints_beyond_the_limits_of_the_arm_are_refused(instrument):
     joints = (tool.lower + tool.upper) / 2
     joints[INSERTION] = tool.upper[INSERTION] + 11.0
     cells = ",".join(repr(value) for value in joints.tolist())
-    with pytest.raises(NotMetres, match=f"beyond the limits .* with {instrument}"):
+    with pytest.raises(errors.NotMetres, match=f"beyond the limits .* with {instrument}"):
         read(f"q1_rad,q2_rad,q3_mm,q4_rad,q5_rad,q6_rad\n{cells}\n", rate_hz=30.0, instrument=instrument)
 
 
@@ -221,7 +212,7 @@ def test_joints_beyond_the_limits_of_the_arm_are_refused(instrument):
 )
 def test_real_tables_agree_with_the_kinematics_and_need_a_rate(name, rows, off_mm, instrument):
     table = (sample_folder() / "calibration" / name).read_bytes()
-    with pytest.raises(BadColumns, match="rate_hz"):
+    with pytest.raises(errors.BadColumns, match="rate_hz"):
         read_recording(io.BytesIO(table))
     recording = read_recording(io.BytesIO(table), untimed=True)
     assert not recording.is_timed

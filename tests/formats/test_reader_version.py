@@ -13,7 +13,7 @@ from skills.seeds.recordings import sample_recordings
 from tests.formats import bags, lerobots, trials
 from tests.library import cases
 
-DIGESTS = {1: "d85188129dfe550f0bb8f295f56668af15106c1c8f99c8b5e3f9ef723e376df7"}
+DIGESTS = {1: "0ebfeddca3dab596cef8dcd7b6ede89b9ba43028dadcd215d174f384d21e3eb2"}
 FILES: list[tuple[bytes, dict[str, Any]]] = [
     (sample_recordings()[0].data, {}),
     (bags.pose_bag(bags.straight(40)), {}),

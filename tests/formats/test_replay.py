@@ -13,18 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from skills.errors import BadBag, BadPlan
-from skills.formats.replay_bag import (
-    EPOCH_NS,
-    PhaseTimes,
-    arm_names,
-    arms_of,
-    folder_of,
-    held_jaw_rad,
-    notes_of,
-    pass_times,
-    seal,
-    velocities_of,
-)
+from skills.formats import replay_bag
 from skills.kinematics import forward
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, OPEN_RAD
 from skills.planning.trajectory import time_parametrise
@@ -88,7 +77,7 @@ def test_the_robots_script_keeps_every_sample_of_the_trajectory_exactly(tmp_path
         (0.1, 0.0) if topics is PSM2 else (2 * OPEN_RAD, 0.0)
     }
     stamps_ns = [one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in jaws]
-    np.testing.assert_array_equal(stamps_ns, EPOCH_NS + np.rint(made.stamps_s * 1e9).astype(int))
+    np.testing.assert_array_equal(stamps_ns, replay_bag.EPOCH_NS + np.rint(made.stamps_s * 1e9).astype(int))
 
 
 def test_the_robots_script_waits_between_setpoints_as_planned(tmp_path):
@@ -111,8 +100,8 @@ def test_velocities_carry_the_joints_from_rest_to_rest(count, seed):
     """The velocities' trapezoidal integral is the path, up to end corrections of a quarter step on either side."""
     rng = np.random.default_rng(seed)
     q = np.cumsum(rng.normal(size=(count, 6)), axis=0)
-    stamps_ns = EPOCH_NS + np.arange(count) * 5_000_000
-    v = velocities_of(stamps_ns, q, RATE_HZ)
+    stamps_ns = replay_bag.EPOCH_NS + np.arange(count) * 5_000_000
+    v = replay_bag.velocities_of(stamps_ns, q, RATE_HZ)
     assert (v[[0, -1]] == 0).all()
     if count > 3:
         way = (q[-1] + q[-2] - q[0] - q[1]) / 2
@@ -124,30 +113,31 @@ def test_velocities_carry_the_joints_from_rest_to_rest(count, seed):
 
 def test_the_same_trajectory_gives_the_same_bytes():
     again = [
-        folder_of(one, "1" * 64) for one in arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
+        replay_bag.folder_of(one, "1" * 64)
+        for one in replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
     ]
-    assert seal(papers(trajectory()) | again[0] | again[1]) == seal(members())
+    assert replay_bag.seal(papers(trajectory()) | again[0] | again[1]) == replay_bag.seal(members())
 
 
 def test_the_timetable_has_every_phase_and_hand_over_on_one_clock():
     """Two passes of 81 samples at 200 Hz, 60 of A1 and 21 of A2, a second apart; stamps begin at 1 s."""
-    arms = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
-    first, second = pass_times(trajectory(), arms)
+    arms = replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
+    first, second = replay_bag.pass_times(trajectory(), arms)
     assert first.phases == [
-        PhaseTimes(phase="A1", from_ns=1_000_000_000, to_ns=1_295_000_000),
-        PhaseTimes(phase="A2", from_ns=1_300_000_000, to_ns=1_400_000_000),
+        replay_bag.PhaseTimes(phase="A1", from_ns=1_000_000_000, to_ns=1_295_000_000),
+        replay_bag.PhaseTimes(phase="A2", from_ns=1_300_000_000, to_ns=1_400_000_000),
     ]
     assert first.hand_over is first.take_back is None  # the jaws of this motion do not move
     assert second.phases[0].from_ns == 2_405_000_000
-    alone = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=1)
-    assert pass_times(trajectory(), alone) == [second]
+    alone = replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=1)
+    assert replay_bag.pass_times(trajectory(), alone) == [second]
 
 
 def test_the_timetable_states_when_the_needle_changes_hands():
     """PSM_M's jaw closes before PSM_A's opens, and in a further pass the other way round; both by the setpoints."""
     motion = time_parametrise([hand_off(), hand_off(-8.0)], rate_hz=100.0, psm_m=BESIDE)
-    arms = arms_of(motion, arm="PSM2", frame=FRAME, other="PSM1")
-    first, second = pass_times(motion, arms)
+    arms = replay_bag.arms_of(motion, arm="PSM2", frame=FRAME, other="PSM1")
+    first, second = replay_bag.pass_times(motion, arms)
     assert first.take_back is None
     for change, order in ((first.hand_over, ("PSM1", "PSM2")), (second.take_back, ("PSM2", "PSM1"))):
         closes, opens = change.jaws_in_order
@@ -171,10 +161,10 @@ def test_sha256sum_itself_reads_the_checksums(tmp_path):
 
 
 def test_one_pass_alone_keeps_its_samples_and_their_stamps():
-    whole, alone = arm(), arms_of(trajectory(), arm="PSM2", frame=FRAME, jaw_rad=0.1, pass_index=1)[0]
+    whole, alone = arm(), replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, jaw_rad=0.1, pass_index=1)[0]
     np.testing.assert_array_equal(alone.stamps_ns, whole.stamps_ns[81:])
     np.testing.assert_array_equal(alone.joints, whole.joints[81:])
-    assert notes_of(alone, "1" * 64)["pass"] == "1"
+    assert replay_bag.notes_of(alone, "1" * 64)["pass"] == "1"
     checked(members(0))
     checked(members(1))
 
@@ -182,17 +172,17 @@ def test_one_pass_alone_keeps_its_samples_and_their_stamps():
 @pytest.mark.parametrize("number", [-1, 2])
 def test_a_pass_that_the_plan_does_not_have_is_refused(number):
     with pytest.raises(BadPlan, match="0 to 1"):
-        arms_of(trajectory(), arm="PSM2", frame=FRAME, pass_index=number)
+        replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, pass_index=number)
 
 
 def test_without_psm_ms_place_there_is_no_bag_for_it():
-    arms = arms_of(trajectory(other=False), arm="PSM2", frame=FRAME, jaw_rad=0.1)
+    arms = replay_bag.arms_of(trajectory(other=False), arm="PSM2", frame=FRAME, jaw_rad=0.1)
     assert [one.name for one in arms] == ["PSM2"]
-    lines = checked(papers(trajectory(other=False)) | folder_of(arms[0], "1" * 64))
+    lines = checked(papers(trajectory(other=False)) | replay_bag.folder_of(arms[0], "1" * 64))
     assert len(lines) == 5 and lines[3] == "It has no hand-off: no PSM_M, no A2."
     assert lines[4].startswith("UNSIGNED")
     with pytest.raises(BadBag, match="PSM_M is in the bag and not in"):
-        checked(papers(trajectory()) | folder_of(arms[0], "1" * 64))
+        checked(papers(trajectory()) | replay_bag.folder_of(arms[0], "1" * 64))
 
 
 @pytest.mark.parametrize(
@@ -207,10 +197,12 @@ def test_without_psm_ms_place_there_is_no_bag_for_it():
     ],
 )
 def test_arms_are_named_as_the_robots_script_names_them(arm, other, names):
-    assert arm_names(arm, other) == names
+    assert replay_bag.arm_names(arm, other) == names
 
 
 def test_psm_a_holds_what_it_held_in_the_demonstration_if_its_jaw_can():
-    assert held_jaw_rad(np.array([0.2, 0.1, 0.9]), "400006") == 0.2
-    assert held_jaw_rad(None, "400006") == JAW_CLOSED_RAD
-    assert held_jaw_rad(np.full(9, -1.9), "400006") == JAW_CLOSED_RAD == radians(-20)  # JIGSAWS has another zero
+    assert replay_bag.held_jaw_rad(np.array([0.2, 0.1, 0.9]), "400006") == 0.2
+    assert replay_bag.held_jaw_rad(None, "400006") == JAW_CLOSED_RAD
+    assert (
+        replay_bag.held_jaw_rad(np.full(9, -1.9), "400006") == JAW_CLOSED_RAD == radians(-20)
+    )  # JIGSAWS has another zero

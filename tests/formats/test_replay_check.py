@@ -12,27 +12,15 @@ import pytest
 from mcap.writer import Writer as McapWriter
 
 from skills.errors import BadBag, SkillsError
-from skills.formats import bag_writer
+from skills.formats import bag_writer, replay_bag
 from skills.formats.bag_writer import bag_folder
-from skills.formats.replay_bag import (
-    EPOCH_NS,
-    ArmMotion,
-    arms_of,
-    folder_of,
-    messages_of,
-    notes_of,
-    seal,
-    velocities_of,
-)
-from skills.formats.verify import check_bag, verify_bag
+from skills.formats.verify import verify_bag
 from tests.formats.others import zipped
 from tests.formats.replays import FRAME, PSM2, RATE_HZ, arm, checked, members, papers, trajectory
 
 
-def test_a_whole_bag_is_found_right_and_told_of(tmp_path):
-    path = tmp_path / "bag.zip"
-    path.write_bytes(seal(members()))
-    lines = verify_bag(path)
+def test_a_whole_bag_is_found_right_and_told_of():
+    lines = verify_bag(io.BytesIO(replay_bag.seal(members())))
     assert lines[0].startswith("10 files")
     assert lines[2].startswith("PSM1 (PSM_M, 420006): 162 samples in 1.80 s")
     assert lines[3].startswith("PSM2 (PSM_A, 400006): 162 samples in 1.80 s")
@@ -46,24 +34,24 @@ def test_a_flipped_byte_is_found_wherever_it_is(name):
 
     The archive's own checksum is correct.
     """
-    with zipfile.ZipFile(io.BytesIO(seal(members()))) as archive:
+    with zipfile.ZipFile(io.BytesIO(replay_bag.seal(members()))) as archive:
         files = {one: archive.read(one) for one in archive.namelist()}
     for place in (0, len(files[name]) // 3, len(files[name]) - 1):
         flipped = bytearray(files[name])
         flipped[place] ^= 0x10
         with pytest.raises(BadBag) as refused:
-            check_bag(io.BytesIO(zipped(files | {name: bytes(flipped)}, zipfile.ZIP_STORED)))
+            verify_bag(io.BytesIO(zipped(files | {name: bytes(flipped)}, zipfile.ZIP_STORED)))
         assert name in str(refused.value)
 
 
 def test_a_flipped_byte_of_the_archive_is_found_by_its_own_checksums():
-    whole = seal(members())
+    whole = replay_bag.seal(members())
     rng = np.random.default_rng(0)
     for place in rng.integers(0, len(whole), 60).tolist():
         flipped = bytearray(whole)
         flipped[place] ^= 1 << int(rng.integers(0, 8))
         try:
-            check_bag(io.BytesIO(bytes(flipped)))
+            verify_bag(io.BytesIO(bytes(flipped)))
         except SkillsError:
             continue
         with zipfile.ZipFile(io.BytesIO(bytes(flipped))) as archive:  # dates and the like: nothing that moves
@@ -74,12 +62,12 @@ def test_a_flipped_byte_of_the_archive_is_found_by_its_own_checksums():
 
 def rewritten(change: Any, name: str = "PSM2") -> dict[str, bytes]:
     """Return the files of a bag in which one arm's messages were changed, with all checksums correct."""
-    said = [one for one in map(change, messages_of(arm(name))) if one is not None]
-    return members() | bag_folder(said, name, notes_of(arm(name), "1" * 64))
+    said = [one for one in map(change, replay_bag.messages_of(arm(name))) if one is not None]
+    return members() | bag_folder(said, name, replay_bag.notes_of(arm(name), "1" * 64))
 
 
-def remade(motion: ArmMotion, plan: str = "1" * 64) -> dict[str, bytes]:
-    return members() | folder_of(motion, plan)
+def remade(motion: replay_bag.ArmMotion, plan: str = "1" * 64) -> dict[str, bytes]:
+    return members() | replay_bag.folder_of(motion, plan)
 
 
 def stamp_of(sample: int) -> int:
@@ -90,7 +78,8 @@ def test_a_changed_stamp_is_found():
     def change(one: bag_writer.Message) -> bag_writer.Message:
         if one.topic != PSM2[2] or one.log_ns != stamp_of(7):
             return one
-        return bag_writer.joint_state(one.topic, one.log_ns + 1, [0.1], ["jaw"], velocities=[0.0], log_ns=one.log_ns)
+        late = bag_writer.joint_state(one.topic, one.log_ns + 1, [0.1], ["jaw"], velocities=[0.0])
+        return replace(late, log_ns=one.log_ns)
 
     with pytest.raises(BadBag, match=r"/PSM2/jaw/setpoint_js has stamps or log times that differ"):
         checked(rewritten(change))
@@ -103,11 +92,11 @@ def test_a_stamp_that_a_robot_would_drop_is_found(first):
     with pytest.raises(BadBag, match="sample 3"):
         checked(remade(replace(arm(), stamps_ns=stamps_ns)))
     with pytest.raises(BadBag, match="sample 0"):
-        checked(remade(replace(arm(), stamps_ns=arm().stamps_ns - EPOCH_NS)))
+        checked(remade(replace(arm(), stamps_ns=arm().stamps_ns - replay_bag.EPOCH_NS)))
 
 
 def test_a_bag_that_was_made_faster_is_found():
-    faster = EPOCH_NS + (arm().stamps_ns - EPOCH_NS) * 9 // 10
+    faster = replay_bag.EPOCH_NS + (arm().stamps_ns - replay_bag.EPOCH_NS) * 9 // 10
     with pytest.raises(BadBag, match="sample 1 is earlier than 200 Hz allows"):
         checked(remade(replace(arm(), stamps_ns=faster)))
 
@@ -180,7 +169,7 @@ NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 
 @pytest.mark.parametrize(("names", "frame"), [((*NAMES[:4], "wrist_yaw", "wrist_pitch"), ""), (NAMES, "ECM"), ((), "")])
 def test_other_names_of_joints_or_frames_are_found(names, frame):
-    speeds = iter(velocities_of(arm().stamps_ns, arm().joints, RATE_HZ).tolist())
+    speeds = iter(replay_bag.velocities_of(arm().stamps_ns, arm().joints, RATE_HZ).tolist())
     joints = iter(arm().joints.tolist())
 
     def change(one: bag_writer.Message) -> bag_writer.Message:
@@ -211,7 +200,10 @@ def test_arms_that_changed_places_are_found():
 
     with pytest.raises(BadBag, match=r"PSM1.mcap has the topic '/PSM2/setpoint_js'"):
         checked({moved(name): data for name, data in members().items()})
-    swapped = [folder_of(one, "1" * 64) for one in arms_of(trajectory(), arm="PSM1", frame=FRAME, jaw_rad=0.1)]
+    swapped = [
+        replay_bag.folder_of(one, "1" * 64)
+        for one in replay_bag.arms_of(trajectory(), arm="PSM1", frame=FRAME, jaw_rad=0.1)
+    ]
     with pytest.raises(BadBag, match="The plan is for PSM2, but the bag has another PSM_A"):
         checked(members() | swapped[0] | swapped[1])
 
@@ -237,7 +229,7 @@ def test_a_topic_without_a_type_is_found():
     out = McapWriter(file)
     out.start(profile="ros2")
     channel = out.register_channel(PSM2[0], "cdr", 0)
-    out.add_message(channel, EPOCH_NS, b"", EPOCH_NS)
+    out.add_message(channel, replay_bag.EPOCH_NS, b"", replay_bag.EPOCH_NS)
     out.finish()
     with pytest.raises(BadBag, match="does not have the type sensor_msgs/msg/JointState"):
         checked(members() | {"PSM2/PSM2.mcap": file.getvalue()})
@@ -319,11 +311,13 @@ def test_a_file_too_few_or_too_many_is_found():
     with pytest.raises(BadBag, match="this has 3"):
         checked(members() | {"PSM3/PSM3.mcap": b""})
     with pytest.raises(BadBag, match="SHA256SUMS must list"):
-        check_bag(io.BytesIO(zipped(members() | {"SHA256SUMS": b"\n"})))
+        verify_bag(io.BytesIO(zipped(members() | {"SHA256SUMS": b"\n"})))
 
 
 def test_metadata_of_something_else_are_found():
-    other = folder_of(arms_of(trajectory(), arm="PSM2", frame=FRAME, pass_index=0)[0], "1" * 64)["PSM2/metadata.yaml"]
+    other = replay_bag.folder_of(replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, pass_index=0)[0], "1" * 64)[
+        "PSM2/metadata.yaml"
+    ]
     mine = members()["PSM2/metadata.yaml"]
     for wrong in (other, mine.replace(b"cdr", b"cbr"), mine + b" ", b"", mine.replace(b"PSM2.mcap", b"PSM1.mcap")):
         with pytest.raises(BadBag, match=r"PSM2/metadata.yaml does not describe"):
@@ -333,9 +327,9 @@ def test_metadata_of_something_else_are_found():
 @pytest.mark.parametrize("data", [b"", b"PK", b"PK\x05\x06" + bytes(18), b"no zip at all" * 9])
 def test_what_is_no_bag_is_refused(data):
     with pytest.raises(SkillsError):
-        check_bag(io.BytesIO(data))
+        verify_bag(io.BytesIO(data))
 
 
 def test_a_bomb_is_refused_before_it_is_unpacked():
     with pytest.raises(SkillsError):
-        check_bag(io.BytesIO(zipped(members() | {"SHA256SUMS": bytes(200 << 20)})))
+        verify_bag(io.BytesIO(zipped(members() | {"SHA256SUMS": bytes(200 << 20)})))

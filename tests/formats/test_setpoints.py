@@ -32,7 +32,8 @@ COUNT = 40
 def tip(k: int, *, x_m: float = 0.001, frame: str = "PSM2_base", turn=TURN, at_ns: int | None = None) -> Message:
     """Return one setpoint of a tip, logged at step k."""
     log_ns = START_NS + k * STEP_NS
-    return messages.pose(TIP, log_ns if at_ns is None else at_ns, frame, (x_m, 0.05, -0.12), turn, log_ns=log_ns)
+    said = messages.pose(TIP, log_ns if at_ns is None else at_ns, frame, (x_m, 0.05, -0.12), turn)
+    return replace(said, log_ns=log_ns)
 
 
 def jaw(k: int, *angles: float) -> Message:

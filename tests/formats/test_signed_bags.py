@@ -19,7 +19,7 @@ import pytest
 
 from skills.errors import BadBag, BadSignature, SkillsError
 from skills.formats.replay_bag import arms_of, folder_of, seal
-from skills.formats.verify import SIGNATURE, check_bag
+from skills.formats.verify import SIGNATURE, verify_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import A1, A2, Trajectory
@@ -87,7 +87,7 @@ def signed(files: Files, key: SigningKey = KEY, head_key: SigningKey = KEY, **fa
 
 def checked(files: Files, key: PublicKey | None = PUBLIC) -> list[str]:
     """Seal files with right checksums and check them."""
-    return check_bag(io.BytesIO(seal(files)), key)
+    return verify_bag(io.BytesIO(seal(files)), key)
 
 
 @cache
@@ -185,7 +185,7 @@ CHANGES: dict[str, Callable[[], Files]] = {
     "the passes exchanged": lambda: bag_of(moved(np.roll(JOINTS, EACH, axis=0))),
     "another instrument": lambda: bag_of(moved(JOINTS, instrument="420006")),
     "the verdict swapped": lambda: edited("verdict.json", report=REPORT | {"trajectory": "6" * 64}),
-    "the verdict surer": lambda: edited("verdict.json", report=REPORT | {"doubt": {"under": []}}),
+    "the verdict surer": lambda: edited("verdict.json", report=REPORT | {"estimate": {"under": []}}),
     "the policy's limits removed": lambda: edited("policy.json", limits=""),
     "the plan's words changed": lambda: edited("plan.json", in_words="It is safe near a person."),
     "another plan with its own verdict": lambda: members() | papers(short()),
@@ -322,7 +322,7 @@ def test_200_flipped_bits_of_the_archive_are_refused_or_change_no_file():
         flipped = bytearray(whole)
         flipped[place // 8] ^= 1 << place % 8
         try:
-            check_bag(io.BytesIO(bytes(flipped)), PUBLIC)
+            verify_bag(io.BytesIO(bytes(flipped)), PUBLIC)
         except SkillsError:
             continue
         with zipfile.ZipFile(io.BytesIO(bytes(flipped))) as archive:  # a date, or another field that means nothing here

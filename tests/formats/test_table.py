@@ -6,17 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skills.errors import (
-    BackwardStamps,
-    BadColumns,
-    BadSettings,
-    NotAQuaternion,
-    NotFinite,
-    NotMetres,
-    NoUsableTopic,
-    UnknownFormat,
-    UnreadableRecording,
-)
+from skills import errors
 from skills.formats import read_recording
 from skills.formats.columns import OUTSIDE_MM, quaternion_of_rpy
 from skills.formats.tables import read_table
@@ -61,7 +51,7 @@ def test_the_papers_header_needs_a_rate():
     motion = read(text, rate_hz=500.0).motion_of()
     assert motion.stamps_ns.tolist() == [0, 2_000_000]
     assert motion.tip_mm[0].tolist() == [10.0, 20.0, 30.0]
-    with pytest.raises(BadColumns, match="rate_hz"):
+    with pytest.raises(errors.BadColumns, match="rate_hz"):
         read(text)
 
 
@@ -101,28 +91,28 @@ def test_any_table_is_read_to_the_last_digit(rows):
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [
-        ("t_s,x_m,y_m,z_m,label\n0,0,0,0,a\n", BadColumns, "'label'"),
-        ("t_s,x_m,x_m,y_m,z_m\n0,0,0,0,0\n", BadColumns, "'x_m' twice"),
-        ("t_s,x_m,Pos X,y_m,z_m\n0,0,0,0,0\n", BadColumns, "'x_m' twice"),
-        ("t_s,x_m,y_m,z_m,x_mm,y_mm,z_mm\n0,0,0,0,0,0,0\n", BadColumns, "twice"),
-        ("t_s,x_m,y_mm,z_m\n0,0,0,0\n", BadColumns, "y_m is missing"),
-        ("t_s,x_m,y_m\n0,0,0\n", BadColumns, "z_m is missing"),
-        ("t_s,x_m,y_m,z_m,qx,qy,qz\n0,0,0,0,0,0,0\n", BadColumns, "qw is missing"),
-        ("t_s,x_m,y_m,z_m,qx,qy,qz,qw,roll_rad,pitch_rad,yaw_rad\n", BadColumns, "twice"),
-        ("x_m,y_m,z_m\n0,0,0\n", BadColumns, "t_s"),
-        ("t_s,jaw_rad\n0,0\n", NoUsableTopic, "no position"),
-        ("t_s,x_m,y_m,z_m\n", UnreadableRecording, "no rows"),
-        ("t_s,x_m,y_m,z_m\n0,0,0,0\n1,0,0\n", UnreadableRecording, "Row 3 has 3 cells"),
-        ("t_s,x_m,y_m,z_m\n0,0,0,0\n\n1,0,0,0\n", UnreadableRecording, "Row 3 has 0 cells"),
-        ("t_s,x_m,y_m,z_m\n0,0,0,0\n1,0,?,0\n", UnreadableRecording, "Row 3, column y_m"),
-        ("t_s,x_m,y_m,z_m\n0,0,1_0,0\n", UnreadableRecording, "Row 2, column y_m"),
-        ("t_s,x_m,y_m,z_m\n0,0,nan,0\n", NotFinite, "Row 2, column y_m"),
-        ("t_s,x_m,y_m,z_m\n0,0,0,1e999\n", NotFinite, "Row 2, column z_m"),
-        ("t_s,x_m,y_m,z_m\n0,0,0,0\n0.5,0,0,0\n0.4,0,0,0\n", BackwardStamps, r"at 0\.500 s"),
-        ("t_s,x_m,y_m,z_m\n1760000000123,0,0,0\n", BadColumns, "seconds"),
-        ("t_s,x_m,y_m,z_m\n0,12,50,-120\n1,13,50,-120\n", NotMetres, "120 m"),
-        ("t_s,x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0,0,1,1,0,0\n", NotAQuaternion, "length 1.41"),
-        ('t_s,x_m,y_m,z_m\n0,0,0,"0\n', UnreadableRecording, "CSV|comma-separated"),
+        ("t_s,x_m,y_m,z_m,label\n0,0,0,0,a\n", errors.BadColumns, "'label'"),
+        ("t_s,x_m,x_m,y_m,z_m\n0,0,0,0,0\n", errors.BadColumns, "'x_m' twice"),
+        ("t_s,x_m,Pos X,y_m,z_m\n0,0,0,0,0\n", errors.BadColumns, "'x_m' twice"),
+        ("t_s,x_m,y_m,z_m,x_mm,y_mm,z_mm\n0,0,0,0,0,0,0\n", errors.BadColumns, "twice"),
+        ("t_s,x_m,y_mm,z_m\n0,0,0,0\n", errors.BadColumns, "y_m is missing"),
+        ("t_s,x_m,y_m\n0,0,0\n", errors.BadColumns, "z_m is missing"),
+        ("t_s,x_m,y_m,z_m,qx,qy,qz\n0,0,0,0,0,0,0\n", errors.BadColumns, "qw is missing"),
+        ("t_s,x_m,y_m,z_m,qx,qy,qz,qw,roll_rad,pitch_rad,yaw_rad\n", errors.BadColumns, "twice"),
+        ("x_m,y_m,z_m\n0,0,0\n", errors.BadColumns, "t_s"),
+        ("t_s,jaw_rad\n0,0\n", errors.NoUsableTopic, "no position"),
+        ("t_s,x_m,y_m,z_m\n", errors.UnreadableRecording, "no rows"),
+        ("t_s,x_m,y_m,z_m\n0,0,0,0\n1,0,0\n", errors.UnreadableRecording, "Row 3 has 3 cells"),
+        ("t_s,x_m,y_m,z_m\n0,0,0,0\n\n1,0,0,0\n", errors.UnreadableRecording, "Row 3 has 0 cells"),
+        ("t_s,x_m,y_m,z_m\n0,0,0,0\n1,0,?,0\n", errors.UnreadableRecording, "Row 3, column y_m"),
+        ("t_s,x_m,y_m,z_m\n0,0,1_0,0\n", errors.UnreadableRecording, "Row 2, column y_m"),
+        ("t_s,x_m,y_m,z_m\n0,0,nan,0\n", errors.NotFinite, "Row 2, column y_m"),
+        ("t_s,x_m,y_m,z_m\n0,0,0,1e999\n", errors.NotFinite, "Row 2, column z_m"),
+        ("t_s,x_m,y_m,z_m\n0,0,0,0\n0.5,0,0,0\n0.4,0,0,0\n", errors.BackwardStamps, r"at 0\.500 s"),
+        ("t_s,x_m,y_m,z_m\n1760000000123,0,0,0\n", errors.BadColumns, "seconds"),
+        ("t_s,x_m,y_m,z_m\n0,12,50,-120\n1,13,50,-120\n", errors.NotMetres, "120 m"),
+        ("t_s,x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0,0,1,1,0,0\n", errors.NotAQuaternion, "length 1.41"),
+        ('t_s,x_m,y_m,z_m\n0,0,0,"0\n', errors.UnreadableRecording, "CSV|comma-separated"),
     ],
 )
 def test_a_table_that_cannot_be_meant_is_refused_with_its_place(text, error, message):
@@ -139,9 +129,9 @@ def test_inches_in_millimetre_columns_are_refused_in_the_whole_workspace():
     for instrument in INSTRUMENTS.values():
         joints = np.random.default_rng(5).uniform(instrument.lower, instrument.upper, (200, 6))
         joints[:, INSERTION] = instrument.upper[INSERTION]
-        with pytest.raises(NotMetres, match=r"inside the cannula.*not in inches"):
+        with pytest.raises(errors.NotMetres, match=r"inside the cannula.*not in inches"):
             read(in_inches(forward(joints, instrument.name)[0]))
-    with pytest.raises(NotMetres, match=r"at most 4\.72 mm from the remote centre \(at 0\.010 s\)"):
+    with pytest.raises(errors.NotMetres, match=r"at most 4\.72 mm from the remote centre \(at 0\.010 s\)"):
         read(in_inches([(0, 0, -100), (0, 0, -120), (0, 0, -110)]))
 
 
@@ -159,23 +149,23 @@ def test_small_numbers_in_another_frame_may_be_millimetres():
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf"), 1e9])
 def test_a_rate_that_is_none_is_refused(rate_hz):
-    with pytest.raises(BadSettings):
+    with pytest.raises(errors.BadSettings):
         read("x_m,y_m,z_m\n0,0,0\n", rate_hz=rate_hz)
 
 
 def test_a_time_said_twice_is_refused():
-    with pytest.raises(BadColumns, match="use one"):
+    with pytest.raises(errors.BadColumns, match="use one"):
         read("t_s,x_m,y_m,z_m\n0,0,0,0\n", rate_hz=100.0)
 
 
 def test_a_table_without_a_header_is_told_so():
-    with pytest.raises(BadColumns, match="no header: its first row has numbers"):
+    with pytest.raises(errors.BadColumns, match="no header: its first row has numbers"):
         read_recording(io.BytesIO(b"-0.01,0.055,-0.135\n-0.01,0.05,-0.13\n"), rate_hz=30.0)
 
 
 def test_an_absurd_exponent_costs_neither_time_nor_memory():
     assert read("t_s,x_m,y_m,z_m\n1e-999999999,0,0,-0.1\n").motion_of().stamps_ns.tolist() == [0]
-    with pytest.raises(NotFinite):
+    with pytest.raises(errors.NotFinite):
         read("t_s,x_m,y_m,z_m\n1e999999999,0,0,0\n")
 
 
@@ -200,10 +190,10 @@ def test_the_callers_file_stays_open():
     ],
 )
 def test_content_of_another_kind_is_an_unknown_format(content):
-    with pytest.raises(UnknownFormat):
+    with pytest.raises(errors.UnknownFormat):
         read_recording(io.BytesIO(content))
 
 
 def test_an_empty_file_is_unreadable():
-    with pytest.raises(UnreadableRecording, match="empty"):
+    with pytest.raises(errors.UnreadableRecording, match="empty"):
         read_recording(io.BytesIO(b""))

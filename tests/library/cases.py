@@ -113,7 +113,7 @@ def ask_training(database: Database, surgeon: str = "kestrel", **asked: Any) -> 
         if "learner" in asked:
             asked["learner"] = describe_learner(asked["learner"])
         if asked.get("combine"):
-            asked["combine"] = {"kind": asked["combine"].kind}
+            asked["combine"] = {"kind": asked["combine"]}
         return request_training(session, TrainingIn(surgeon=surgeon, suture=SUTURE, **asked), "test")[0]
 
 

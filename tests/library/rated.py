@@ -64,7 +64,7 @@ def trial(skill: float, rng: np.random.Generator) -> tuple[np.ndarray, str]:
     arms = [instrument(side, clumsy, moving, rest, rng) for side in range(2)]
     gestures = f"1 {rest} G1 \n{rest + 1} {rest + moving // 2} G6 \n{rest + moving // 2 + 1} {rest + moving} G4 \n"
     masters = [np.hstack([2.0 * one[:, :3], one[:, 3:]]) for one in arms]
-    return np.hstack([*masters, *arms]), gestures
+    return np.hstack([*masters, *arms[::-1]]), gestures
 
 
 def instrument(side: int, clumsy: float, moving: int, rest: int, rng: np.random.Generator) -> np.ndarray:

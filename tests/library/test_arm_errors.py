@@ -52,7 +52,7 @@ def tracked_bag(file: Path, count: int = 4000, late_ns: int = 0) -> Path:
         at_ns = 10**15 + k * 10**7 + 5 * 10**6 + late_ns
         place = (marker_mm[k] + marker_mm[k + 1]) / 2000 if not 2000 <= k < 2100 else [np.nan] * 3
         if not 1000 <= k < 1500:
-            said.append(messages.pose("/NDI/tool/measured_cp", at_ns, "NDI", tuple(place), (0, 0, 0, 1), log_ns=at_ns))
+            said.append(messages.pose("/NDI/tool/measured_cp", at_ns, "NDI", tuple(place), (0, 0, 0, 1)))
     return written(file, said)
 
 
@@ -72,7 +72,7 @@ def poses(count: int, setpoints: bool = True) -> list[Message]:
         if setpoints or "measured" in topic:
             for k, (tip, turn) in enumerate(zip(tips / 1000, quaternion_of(jaws), strict=True)):
                 at_ns = 10**15 + k * 10**7 - before_ns
-                said.append(messages.pose(topic, at_ns, "PSM1_base", tuple(tip), tuple(turn), log_ns=at_ns))
+                said.append(messages.pose(topic, at_ns, "PSM1_base", tuple(tip), tuple(turn)))
     return said
 
 

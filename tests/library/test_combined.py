@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from skills.comparison.combining import COMBININGS, Barycentre, Corridor, Medoid
+from skills.comparison.combining import COMBININGS
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release
 from skills.db.packed import digest
 from skills.db.session import Database
@@ -36,9 +36,9 @@ from tests.library.styles import counted, retrain
 
 SHIFTS_MM = ((0.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 1.5, 0.5))
 GONE = pytest.mark.parametrize(  # the demonstration that the policy's row names, and another one
-    ("how", "gone"), [(Medoid(), 2), (Medoid(), 0), (Corridor(), 2), (Corridor(), 1)], ids=str
+    ("how", "gone"), [("medoid", 2), ("medoid", 0), ("corridor", 2), ("corridor", 1)], ids=str
 )
-HOWS = pytest.mark.parametrize("how", [one() for one in COMBININGS.values()], ids=lambda how: how.kind)
+HOWS = pytest.mark.parametrize("how", COMBININGS)
 
 
 def add_three(database: Database) -> list[Demonstration]:
@@ -67,7 +67,7 @@ def test_it_names_all_of_them_passes_the_gate_and_is_verified(database: Database
         assert [one.sha256 for one in stored.demonstrations] == version.manifest.demos
         assert digest(path_of(stored)) == digest(learnt(stored).path)
     said = version.manifest.combined
-    assert said.kind == how.kind
+    assert said.kind == how
     assert len(said.width_mm) == len(version.manifest.waypoints)
     assert len(said.apart_mm) == 3
 
@@ -75,14 +75,14 @@ def test_it_names_all_of_them_passes_the_gate_and_is_verified(database: Database
 def test_demos_are_combined_as_a_corridor_by_default_in_any_order(database: Database):
     demos = add_three(database)
     job = cases.ask_training(database, demos=[demo.sha256 for demo in demos])
-    again = cases.ask_training(database, demos=[demo.sha256 for demo in demos[::-1]], combine=Corridor())
+    again = cases.ask_training(database, demos=[demo.sha256 for demo in demos[::-1]], combine="corridor")
     assert job.request["combine"] == {"kind": "corridor"}
     assert again.row == job.row
 
 
 def test_the_medoid_is_one_of_them_and_its_path_that_ones(database: Database):
     demos = add_three(database)
-    version = train(database, demos, combine=Medoid())
+    version = train(database, demos, combine="medoid")
     assert version.manifest.combined.medoid == demos[2].sha256  # which lies between the others
     with database.reading() as session:
         stored = find_by_digest(session, version.sha256)
@@ -92,7 +92,7 @@ def test_the_medoid_is_one_of_them_and_its_path_that_ones(database: Database):
 
 def test_the_middle_lies_between_the_demonstrations(database: Database):
     demos = add_three(database)
-    version = train(database, demos, combine=Barycentre())
+    version = train(database, demos, combine="barycentre")
     with database.reading() as session:
         way = learnt_from(find_by_digest(session, version.sha256))
     between = cases.points_mm((0.0, 1.5, 0.5))
@@ -135,7 +135,7 @@ def test_one_that_leaves_while_it_is_learnt_from_leaves_no_policy(database: Data
     request = cases.ask_training(database, demos=[demo.sha256 for demo in demos]).request
     read = fetch(database, training.lessons, [demo.row for demo in demos])
     learnt_meanwhile = training.learn_style(
-        training.combined_lesson(read, Corridor()), request, Settings(database_url=database.url)
+        training.combined_lesson(read, "corridor"), request, Settings(database_url=database.url)
     )
     commit(database, leave, demos[0].sha256, "test")
     with pytest.raises((Conflict, NotFound), match=why), database.writing() as session:
@@ -146,7 +146,7 @@ def test_one_that_leaves_while_it_is_learnt_from_leaves_no_policy(database: Data
 def test_the_overview_does_not_wait_for_a_training_of_what_is_among_them(database: Database):
     first, last, between = SHIFTS_MM
     demos = [cases.add_demo(database, cases.hand_off(shift)) for shift in (first, between, last)]
-    assert train(database, demos, combine=Medoid()).demonstration_row == demos[1].row  # and that is not the newest
+    assert train(database, demos, combine="medoid").demonstration_row == demos[1].row  # and that is not the newest
     for waits in (False, True):
         with database.reading() as session:
             (row,) = [styles for surgeon, styles in matrix(session).rows if surgeon.slug == "kestrel"]
@@ -173,7 +173,7 @@ def test_a_plan_follows_it_and_a_card_tells_of_it(database: Database, how):
         asked = requested_motion(plan.plan, learnt(stored), hand_of(stored))
     assert all(one.value <= one.limit for one in compare(asked, trajectory_of(plan.plan)).greatest)
     assert "3 recorded demonstrations" in card.facts.what_it_is[0]
-    assert card.facts.combined.kind == how.kind
+    assert card.facts.combined.kind == how
     links = [(link.what, link.sha256) for link in card.facts.lineage.chain]
     assert [sha256 for what, sha256 in links if what == "demonstration"] == version.manifest.demos
     assert links[-1] == ("policy", version.sha256)
@@ -181,7 +181,7 @@ def test_a_plan_follows_it_and_a_card_tells_of_it(database: Database, how):
 
 def test_a_style_that_used_its_newest_demo_among_others_is_not_stale(database: Database):
     demos = add_three(database)
-    train(database, demos, combine=Medoid())
+    train(database, demos, combine="medoid")
     assert retrain(database, only_stale=True).request["styles"] == 0
     cases.add_demo(database, cases.hand_off((0.0, 0.0, 2.0)))
     assert retrain(database, only_stale=True).request["styles"] == 1
@@ -197,7 +197,7 @@ def test_what_cannot_be_combined_is_refused_before_a_job_is_made(database: Datab
         ([one, one], None, "named twice"),
         ([one, other_arm], None, "one arm"),
         ([one, herons], None, "another style"),
-        ([one], Medoid(), "is not combined"),
+        ([one], "medoid", "is not combined"),
         ([one, two] * 26, None, "At most 50"),
     ):
         with pytest.raises(BadInput, match=why):

@@ -7,7 +7,6 @@ import pytest
 from sqlalchemy import event, select
 from sqlalchemy.exc import IntegrityError
 
-from skills.comparison.combining import Medoid
 from skills.db.models import Demonstration, DemonstrationOutcome, PolicyVersion, Release
 from skills.db.row_visibility import Only
 from skills.db.service_tables import Event
@@ -209,7 +208,7 @@ def test_a_card_states_the_samples_that_were_dropped(database: Database):
     rows[50] = rows[50].replace("0.50,", "0.48,")
     demo = cases.add_demo(database, "\n".join(["t_s,x_mm,y_mm,z_mm", *rows, rows[-1]]).encode(), segment="whole")
     sound = add(database, 1.0)
-    version = cases.train(database, demos=[demo.sha256, sound.sha256], combine=Medoid())
+    version = cases.train(database, demos=[demo.sha256, sound.sha256], combine="medoid")
     with database.reading() as session:
         card = card_of(session, find_by_digest(session, version.sha256)).facts.model_dump()
     said, none = (one["quality_in_words"] for one in card["demonstrations"])
@@ -245,7 +244,7 @@ def test_a_mark_withdraws_the_releases_that_rest_on_it(database: Database, outco
 
 def test_a_mark_of_one_of_several_demonstrations_withdraws_the_release(database: Database):
     first, second, third = add(database), add(database, 1.0), add(database, 5.0)
-    cases.train(database, demos=[first.sha256, second.sha256], combine=Medoid(), release=True)
+    cases.train(database, demos=[first.sha256, second.sha256], combine="medoid", release=True)
     cases.train(database, demos=[third.sha256], release=True)
     mark(database, first, "failure")
     assert served(database) == [2]

@@ -31,7 +31,7 @@ from tests.planning.test_trajectory import BESIDE
 
 REPORT = {
     "failure": None,
-    "failure_in_words": None,
+    "failure_sentence": None,
     "settings": {"clearance_pad_mm": 1.0, "clearance_psm_m_mm": 0.5},
 }
 

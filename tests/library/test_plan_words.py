@@ -40,8 +40,8 @@ def shown(scene: Scene, learnt: str | None = None, *differs: str) -> PlanScene:
 
 
 def line_of(of: PlanDescription, doubt: SuccessEstimate, errors: ArmErrors = CALIBRATED, **more: Any) -> Headline:
-    stored = {"check_version": CHECK_VERSION, "stated_by": "installation", "feasible": True, "doubt": doubt}
-    report: Any = SimpleNamespace(**stored | {"failure_in_words": "Pass 0, A1, sample 3: no."} | more)
+    stored = {"check_version": CHECK_VERSION, "stated_by": "installation", "feasible": True, "estimate": doubt}
+    report: Any = SimpleNamespace(**stored | {"failure_sentence": "Pass 0, A1, sample 3: no."} | more)
     return headline(of, report, errors=errors, lower_bound=0.95)
 
 
@@ -160,7 +160,7 @@ def test_without_a_hand_off_no_error_is_said_to_cost_success():
 def test_what_lowers_a_probability_is_named_also_if_it_is_no_arm_error(count, without, shift_mm, words):
     settings = EstimateSettings(suture_point_mm=shift_mm)
     cost = Cost("tip_bias_mm", probability(without, 20))
-    report: Any = SimpleNamespace(doubt=doubted(probability(count, 20), of_pass(), cost=cost, settings=settings))
+    report: Any = SimpleNamespace(estimate=doubted(probability(count, 20), of_pass(), cost=cost, settings=settings))
     assert words in (costs_most(report) or "")
 
 

@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from sqlalchemy import delete, func, select, text
 
-from skills.comparison.combining import Corridor
 from skills.db.models import Demonstration, ParsedChunk, ParsedRecording, PolicyVersion, StoredPoses
 from skills.db.session import Database
 from skills.demonstration.motion import Motion, Signal
@@ -19,6 +18,7 @@ from skills.formats.bag_writer import write_mcap
 from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
+from skills.library.operation.inspection import HISTORY, inspect_installation
 from skills.library.people.erasure import erase_demo
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies import learning, training
@@ -30,7 +30,7 @@ from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
-from tests.library.cases import commit, fetch, wrong
+from tests.library.cases import commit, fetch
 from tests.library.styles import NO_CONSENT, ask_retraining, parts_of, retrain, states_of
 
 MCAP = "application/vnd.mcap"
@@ -104,6 +104,11 @@ def stored(database: Database) -> int:
 def rows_of(database: Database) -> list[Any]:
     with database.reading() as session:
         return [tuple(row) for row in session.execute(text("SELECT sha256, policy_row, poses FROM pose_styles"))]
+
+
+def wrong(database: Database) -> list[tuple[str, str]]:
+    parts = {id(part): part for part in inspect_installation(database)}.values()
+    return [one for part in parts if part.what != HISTORY for one in part.wrong]
 
 
 def test_a_training_stores_the_poses_of_its_demonstration(database: Database):
@@ -201,10 +206,10 @@ def test_the_other_arm_is_learnt_if_every_recording_has_it_all_along(database: D
     cases.add_surgeon(database)
     has = [add_both(database, shift) for shift in (0.0, 2.5)]
     has_not = add(database, turning(1.0, **{"other": "PSM1"} | without), arm="PSM2", segment="whole")
-    both = cases.train(database, demos=[one.sha256 for one in has], combine=Corridor())
+    both = cases.train(database, demos=[one.sha256 for one in has], combine="corridor")
     other = beside(database, both)
     assert other is not None and other.arm == "PSM1"
-    mixed = cases.train(database, demos=[one.sha256 for one in (*has, has_not)], combine=Corridor())
+    mixed = cases.train(database, demos=[one.sha256 for one in (*has, has_not)], combine="corridor")
     assert beside(database, mixed) is None
     assert wrong(database) == []
 

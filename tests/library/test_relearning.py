@@ -10,7 +10,6 @@ import pytest
 from sqlalchemy import select, text, update
 
 from skills.cli.operation import state_of
-from skills.comparison.combining import Corridor
 from skills.db.models import Demonstration, PolicyVersion, StoredPoses
 from skills.db.packed import digest
 from skills.db.session import Database
@@ -57,9 +56,9 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cases.train(database, seed=2**40 + 1, learner=PhaseQLearning(join_share=0.5))
     cases.train(database, learner=cases.PUBLISHED)
     cases.train(database, scene=SCENE.as_json(), learner=SLIPPING)
-    cases.train(database, learner=ValueIteration(), combine=Corridor(), **two)
+    cases.train(database, learner=ValueIteration(), combine="corridor", **two)
     commit(database, mark_demo, demos[1].sha256, "recovery", None, "test")
-    cases.train(database, outcomes="any", combine=Corridor(), **two)
+    cases.train(database, outcomes="any", combine="corridor", **two)
     with database.writing() as session:  # not as when it was learnt from
         mark_demo(session, demos[2].sha256, "failure", None, "test")
     database.close()
@@ -154,7 +153,7 @@ def test_another_motion_of_the_other_arm_with_its_digest_is_named(tmp_path: Path
         add_both(database, shift_mm)
     with database.reading() as session:
         demos = [one.sha256 for one in session.scalars(select(Demonstration).order_by(Demonstration.row))]
-    cases.train(database, demos=demos, combine=Corridor())
+    cases.train(database, demos=demos, combine="corridor")
     cases.train(database, demos=demos[:1])
     assert [part.wrong for part in parts(database).values()] == [[], []]
     with database.reading() as session:

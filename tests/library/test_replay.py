@@ -19,7 +19,7 @@ from skills.db.packed import digest as digest_of
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt, NotFound
 from skills.formats.replay_bag import arms_of
-from skills.formats.verify import check_bag
+from skills.formats.verify import verify_bag
 from skills.library.operation.history import sign_history
 from skills.library.operation.integrity import planned
 from skills.library.people.surgeons import find_surgeon
@@ -60,7 +60,7 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
     if trajectory.psm_m is not None:
         tip_mm, apart_mm = psm_m_poses(trajectory, measured.looked_at)[0], np.full((len(trajectory), 24), 5.0)
         measured = replace(measured, psm_m_tip_mm=tip_mm, clearances_mm=apart_mm)
-    chosen = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of(trajectory)} | more
+    chosen = {"feasible": feasible, "failure_sentence": words, "trajectory": digest_of(trajectory)} | more
     report = verdict_on(plan.sha256, trajectory, measured, **chosen)
     identity = digest or report.identity
     with database.writing() as session:
@@ -97,7 +97,7 @@ def test_a_plan_is_cleared_by_its_own_newest_feasible_playback(database: Databas
     assert gate(database, plan) == first
     newer = judged(database, plan, samples=7)
     assert gate(database, plan) == newer
-    judged(database, plan, doubt=doubt_of(0.5))
+    judged(database, plan, estimate=doubt_of(0.5))
     with pytest.raises(Conflict, match=r"only 0.500, and 0.9 is required"):
         gate(database, plan)
     gate(database, plan, lower_bound=0.5)
@@ -211,37 +211,37 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
 @pytest.mark.parametrize(
     ("stored", "asked", "words"),
     [
-        ({"doubt": doubt_of(0.95)}, {}, None),
-        ({"doubt": doubt_of(0.9)}, {}, None),
-        ({"doubt": doubt_of(0.95, 0.91)}, {}, None),
-        ({"doubt": doubt_of(0.95, 0.89)}, {}, "only 0.890, and 0.9 is required"),
-        ({"doubt": doubt_of(0.0)}, {"lower_bound": 0.0}, None),
-        ({"doubt": doubt_of(math.nan)}, {}, "only nan"),
-        ({"doubt": doubt_of(0.95)}, {"lower_bound": math.nan}, "nan is required"),
+        ({"estimate": doubt_of(0.95)}, {}, None),
+        ({"estimate": doubt_of(0.9)}, {}, None),
+        ({"estimate": doubt_of(0.95, 0.91)}, {}, None),
+        ({"estimate": doubt_of(0.95, 0.89)}, {}, "only 0.890, and 0.9 is required"),
+        ({"estimate": doubt_of(0.0)}, {"lower_bound": 0.0}, None),
+        ({"estimate": doubt_of(math.nan)}, {}, "only nan"),
+        ({"estimate": doubt_of(0.95)}, {"lower_bound": math.nan}, "nan is required"),
         (
-            {"doubt": doubt_of(0.85)},
+            {"estimate": doubt_of(0.85)},
             {},
             "the errors of an uncalibrated arm a pass .* Most is lost by the offset of PSM_M's base: wi",
         ),
         (
-            {"doubt": doubt_of(0.95)},
+            {"estimate": doubt_of(0.95)},
             {"errors": CALIBRATED},
             "of an uncalibrated arm, which .* states the errors of a calibrated arm",
         ),
-        ({"doubt": doubt_of(0.95), "stated_by": "request"}, {"errors": CALIBRATED}, None),
+        ({"estimate": doubt_of(0.95), "stated_by": "request"}, {"errors": CALIBRATED}, None),
         (
-            {"doubt": doubt_of(0.85, errors=CALIBRATED), "stated_by": "request"},
+            {"estimate": doubt_of(0.85, errors=CALIBRATED), "stated_by": "request"},
             {},
             "With the errors of a calibrated arm a pass",
         ),
-        ({"doubt": doubt_of()}, {}, "only nan"),
+        ({"estimate": doubt_of()}, {}, "only nan"),
         (
-            {"doubt": doubt_of(0.99, version=JUDGE_VERSION - 1)},
+            {"estimate": doubt_of(0.99, version=JUDGE_VERSION - 1)},
             {},
             "judged by another version of the checks; play it again",
         ),
-        ({"doubt": doubt_of(0.99, version=JUDGE_VERSION + 1)}, {}, "judged by another version"),
-        ({"doubt": doubt_of(0.99), "check_version": CHECK_VERSION - 1}, {}, "judged by another version"),
+        ({"estimate": doubt_of(0.99, version=JUDGE_VERSION + 1)}, {}, "judged by another version"),
+        ({"estimate": doubt_of(0.99), "check_version": CHECK_VERSION - 1}, {}, "judged by another version"),
     ],
 )
 def test_the_least_certain_pass_has_to_reach_the_lower_bound(stored, asked, words):
@@ -262,7 +262,7 @@ def test_the_bag_is_complete_deterministic_and_holds_the_plans_samples(database:
         replay_bag(database, "0" * 64, OF_A1_ALONE)
     data = replay_bag(database, plan.sha256, OF_A1_ALONE)
     assert data == replay_bag(database, plan.sha256, OF_A1_ALONE)
-    lines = check_bag(io.BytesIO(data))
+    lines = verify_bag(io.BytesIO(data))
     assert playback[:12] in lines[1]
     with database.reading() as session:
         trajectory = trajectory_of(find_plan(session, plan.sha256).plan)
@@ -296,7 +296,7 @@ def test_the_bag_is_signed_under_the_first_checkpoint_with_its_verdict(database:
         note = newest_checkpoint(session.connection()) or ""  # the export has signed the history
     head = read_notes(note)[0].checkpoint
     key = PublicKey(head.origin, database.history.key.public)
-    line = check_bag(io.BytesIO(data), key)[-1]
+    line = verify_bag(io.BytesIO(data), key)[-1]
     assert f"the history of {head.size} leaves with the root {head.root.hex()[:12]}" in line
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert f"{head.size} leaves, root {head.root.hex()}" in archive.read("README.txt").decode()
@@ -345,7 +345,7 @@ def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
 
 def samples(database: Database, plan: Plan, pass_index: int | None = None) -> list[tuple[str, int]]:
     """Check a bag, and count each arm's samples."""
-    lines = check_bag(io.BytesIO(replay_bag(database, plan.sha256, OF_A1_ALONE, pass_index)))
+    lines = verify_bag(io.BytesIO(replay_bag(database, plan.sha256, OF_A1_ALONE, pass_index)))
     return [(line.split()[0], int(line.split()[3])) for line in lines[2:-1]]
 
 

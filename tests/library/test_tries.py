@@ -93,7 +93,7 @@ def test_a_bag_comes_to_a_verdict_with_every_question_answered(database: Databas
         }
         assert release.policy_row == version.row
         assert plan.about.passes[0].position_mm == version.manifest.goal_mm
-        assert playback.feasible and playback.report.doubt.under[0].errors.name == "calibrated"
+        assert playback.feasible and playback.report.estimate.under[0].errors.name == "calibrated"
     assert "feasible in an exact simulation" in steps(job)[-1]["text"]
 
 

@@ -6,7 +6,6 @@ import pytest
 from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
-from skills.comparison.combining import Medoid
 from skills.db.models import Base, Erasure, Plan, StoredPictures, Surgeon
 from skills.db.service_tables import Event, Job
 from skills.db.session import Database
@@ -51,7 +50,7 @@ def learn(database: Database, surgeon: str, demo: str, other: str | None, seed: 
     version = cases.train(database, surgeon, demos=[demo], seed=seed, **asked)
     cases.train(database, surgeon, demos=[demo], seed=seed, learner=MaxEntIRL(iterations=2))
     if other is not None:
-        cases.train(database, surgeon, demos=[demo, other], combine=Medoid(), seed=seed)
+        cases.train(database, surgeon, demos=[demo, other], combine="medoid", seed=seed)
     plan = cases.add_plan(database, surgeon, version=version.version)
     with database.writing() as session:
         measured = ideal_playback(trajectory_of(planned(session.get_one(Plan, plan.row))))

@@ -55,8 +55,8 @@ def verdict_on(of_plan: str, motion: Trajectory, measured: Playback, **chosen: A
     """Return the verdict on a motion, with some of its fields as chosen."""
     report = replace(judge(measured, motion), feasible=True, failure=None)
     stated = {
-        "failure_in_words": None,
-        "doubt": doubt_of(0.97),
+        "failure_sentence": None,
+        "estimate": doubt_of(0.97),
         "plan": of_plan,
         "trajectory": "0" * 64,
         "policy": PolicyName(version=1, sha256="0" * 64),

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
-from skills.comparison.combining import COMBININGS, Corridor
+from skills.comparison.combining import COMBININGS
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRewardMap
 from skills.db.packed import digest
 from skills.db.session import Database
@@ -164,9 +164,9 @@ def train(database: Database, folder: Path, *, night: bool) -> dict[str, PolicyV
         for name, learner in list(LEARNERS.items())[: len(LEARNERS) if night else BY_DAY]
     }
     versions["scene"] = cases.train(database, demos=tables[:1], scene=SCENE.as_json(), learner=SLIPPING)
-    for name, how in COMBININGS.items() if night else ():
-        versions[name] = cases.train(database, demos=tables, combine=how())
-    versions["several poses"] = cases.train(database, demos=turns, combine=Corridor())
+    for name in COMBININGS if night else ():
+        versions[name] = cases.train(database, demos=tables, combine=name)
+    versions["several poses"] = cases.train(database, demos=turns, combine="corridor")
     both = [store(database, folder / f"both {number}.mcap", arm="PSM2", segment="whole") for number in (0, 1)]
     versions["two arms"] = cases.train(database, demos=[one.sha256 for one in both], release=True)
     return versions

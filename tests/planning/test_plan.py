@@ -9,22 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
+from skills import kinematics
 from skills.db.packed import digest
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, BadPlan, BadSpeed, ImproperRotation, NoApproach, OutsideGrid
 from skills.gridworld.grid import discretize, fit_grid
 from skills.gridworld.reward import sparse_reward
-from skills.kinematics import (
-    CLASSIC,
-    JAW_TIP_MM,
-    POINTING_DOWN,
-    _nearest_limit,
-    forward,
-    instrument_of,
-    matrix_of,
-    quaternion_of,
-    solutions_of,
-)
 from skills.learning.certificate import certify
 from skills.learning.policy import Policy, learn_tabular, rollout, rollout_from
 from skills.learning.q_learning import PhaseQLearning
@@ -56,13 +46,13 @@ def stacked(points, **given_):
 def test_a_pass_is_the_demo_moved_rigidly_with_its_goal_on_the_point(place_mm, turn_xyzw):
     path = named_path(NAME)
     (one,) = stacked([SuturePoint(place_mm, turn_xyzw)]).passes
-    turned = matrix_of([turn_xyzw])[0]
+    turned = kinematics.matrix_of([turn_xyzw])[0]
     expected = np.array([turned @ (tip - path.tip_mm[-1]) + place_mm for tip in path.tip_mm])
     assert one.tip_mm == pytest.approx(expected, abs=EXACT_MM)
     assert one.tip_mm[-1] == pytest.approx(place_mm, abs=EXACT_MM)
     assert one.start_mm == pytest.approx(expected[0], abs=EXACT_MM)
     assert one.states.tolist() == path.states.tolist()
-    assert one.rotation == pytest.approx(turned @ POINTING_DOWN, abs=1e-12)
+    assert one.rotation == pytest.approx(turned @ kinematics.POINTING_DOWN, abs=1e-12)
 
 
 @settings(deadline=None)
@@ -70,7 +60,7 @@ def test_a_pass_is_the_demo_moved_rigidly_with_its_goal_on_the_point(place_mm, t
 def test_from_any_start_of_the_moved_grid_a_pass_is_the_moved_rollout(place_mm, turn_xyzw, start, off_mm):
     policy, grid = learnt(NAME), named_path(NAME).grid
     start %= grid.n_states
-    turned, goal_mm = matrix_of([turn_xyzw])[0], grid.centres_mm(policy.path.goal)
+    turned, goal_mm = kinematics.matrix_of([turn_xyzw])[0], grid.centres_mm(policy.path.goal)
     start_mm = turned @ (grid.centres_mm(start) + off_mm - goal_mm) + place_mm
     (one,) = stacked([SuturePoint(place_mm, turn_xyzw)], starts_mm=[start_mm]).passes
     moved = (rollout_from(policy, start).tip_mm - goal_mm) @ turned.T + place_mm
@@ -110,7 +100,7 @@ def test_a_start_that_is_the_centre_of_its_cell_is_not_given_twice():
 
 
 def test_the_jaw_is_the_demonstrated_one_where_it_is_known():
-    known = matrix_of([QUARTER_ABOUT_Z])[0] @ POINTING_DOWN
+    known = kinematics.matrix_of([QUARTER_ABOUT_Z])[0] @ kinematics.POINTING_DOWN
     assert stacked([SuturePoint((0, 0, -120))]).orientation == "assumed tool-down"
     plan = stacked([SuturePoint((0, 0, -120))], rotation=known)
     assert plan.orientation == "demonstrated"
@@ -153,7 +143,7 @@ def hand_along(name):
 @given(places_mm, turns_xyzw, st.integers(0, 1000), st.tuples(*[st.floats(-2.4, 2.4)] * 3))
 def test_with_its_demonstration_a_pass_is_the_fitted_path_moved(place_mm, turn_xyzw, start, off_mm):
     policy, grid, demo = learnt(NAME), named_path(NAME).grid, hand_along(NAME)
-    turned, goal_mm = matrix_of([turn_xyzw])[0], demo.tip_mm[-1]
+    turned, goal_mm = kinematics.matrix_of([turn_xyzw])[0], demo.tip_mm[-1]
     here_mm = grid.centres_mm(start % grid.n_states) + off_mm
     start_mm = turned @ (here_mm - goal_mm) + place_mm
     plan = stacked([SuturePoint(place_mm, turn_xyzw)] * 2, starts_mm=[None, start_mm], demo=demo)
@@ -177,7 +167,7 @@ def test_a_pass_from_outside_its_grid_enters_at_the_nearest_place(place, turn, o
     here = (low + high) / 2 + off_mm
     entered = np.clip(here, low, high)
     outside_mm = np.linalg.norm(here - entered)
-    turned, goal_mm = matrix_of([turn])[0], policy.path.tip_mm[-1]
+    turned, goal_mm = kinematics.matrix_of([turn])[0], policy.path.tip_mm[-1]
     start_mm = turned @ (here - goal_mm) + place
     if outside_mm > MAX_OUTSIDE_MM + 1e-6:
         with pytest.raises(OutsideGrid, match="Pass 0 starts outside"):
@@ -210,14 +200,16 @@ def test_the_nearest_place_is_worked_by_hand():
 def test_a_suture_point_may_be_where_the_finger_tips_go():
     point, start = SuturePoint((0.0, 50.0, -130.0), QUARTER_ABOUT_Z), (5.0, 50.0, -130.0)
     hinge = stacked([point], starts_mm=[start])
-    fingers = stacked([point], starts_mm=[start], tip_offset_mm=JAW_TIP_MM)
-    up = np.array([0.0, 0.0, JAW_TIP_MM])  # the tool points down, so the hinge is above the requested point
+    fingers = stacked([point], starts_mm=[start], tip_offset_mm=kinematics.JAW_TIP_MM)
+    up = np.array([0.0, 0.0, kinematics.JAW_TIP_MM])  # the tool points down, so the hinge is above the requested point
     for one, other in zip(hinge.passes, fingers.passes, strict=True):
         assert other.tip_mm == pytest.approx(one.tip_mm + up, abs=1e-9)
         assert other.start_mm == pytest.approx(one.start_mm + up, abs=1e-9)
         assert other.point == one.point
-        assert other.tip_mm[-1] + JAW_TIP_MM * other.rotation[:, 2] == pytest.approx(point.position_mm, abs=1e-9)
-    assert (hinge.tip_offset_mm, fingers.tip_offset_mm) == (0.0, JAW_TIP_MM)
+        assert other.tip_mm[-1] + kinematics.JAW_TIP_MM * other.rotation[:, 2] == pytest.approx(
+            point.position_mm, abs=1e-9
+        )
+    assert (hinge.tip_offset_mm, fingers.tip_offset_mm) == (0.0, kinematics.JAW_TIP_MM)
 
 
 @pytest.mark.parametrize("wrong", [{"tip_offset_mm": -1.0}, {"tip_offset_mm": 51.0}, {"tip_offset_mm": np.nan}])
@@ -333,7 +325,7 @@ def test_a_turn_that_is_none_is_refused():
 @given(turns_xyzw)
 def test_a_rotation_written_as_a_quaternion_is_the_same_rotation(turn_xyzw):
     rotation = rotation_of(np.array([turn_xyzw, (0, 0, 0, 1)]))
-    assert matrix_of([pose_xyzw(rotation)])[0] == pytest.approx(rotation, abs=1e-12)
+    assert kinematics.matrix_of([pose_xyzw(rotation)])[0] == pytest.approx(rotation, abs=1e-12)
 
 
 def test_a_demonstration_without_orientations_has_no_rotation():
@@ -363,7 +355,7 @@ def demonstrated(y_mm: float) -> Demo:
         end_s=(len(tip) - 1) / 50,
         stamps_s=np.arange(len(tip)) / 50,
         tip_mm=tip,
-        rotation_xyzw=np.tile(quaternion_of(POINTING_DOWN[None]), (len(tip), 1)),
+        rotation_xyzw=np.tile(kinematics.quaternion_of(kinematics.POINTING_DOWN[None]), (len(tip), 1)),
     )
 
 
@@ -375,11 +367,11 @@ def learnt_from(demo: Demo) -> Policy:
 
 def searched_mm(tip_mm: np.ndarray) -> float:
     """Search joints within the limits for the pose with the jaw down; return the best error found, mm and 10 mrad."""
-    lower, upper = np.array(CLASSIC.lower), np.array(CLASSIC.upper)
+    lower, upper = np.array(kinematics.CLASSIC.lower), np.array(kinematics.CLASSIC.upper)
 
     def off(joints: np.ndarray) -> np.ndarray:
-        tip, rotation = forward(joints[None])
-        return np.concatenate([tip[0] - tip_mm, 100 * (rotation[0] - POINTING_DOWN).ravel()])
+        tip, rotation = kinematics.forward(joints[None])
+        return np.concatenate([tip[0] - tip_mm, 100 * (rotation[0] - kinematics.POINTING_DOWN).ravel()])
 
     begin = np.array([0.0, -0.8, 150.0, 0.0, 0.8, 0.0])
     return float(np.linalg.norm(least_squares(off, begin, bounds=(lower, upper), x_scale=upper - lower).fun))
@@ -424,9 +416,11 @@ def test_a_pass_that_does_not_reach_its_goal_cannot_be_driven():
 
 def test_a_place_without_joints_is_beyond_all_others():
     tip_mm = np.array([[0.0, 0.0, -400.0], [0.0, 50.0, -120.0]])
-    solutions = solutions_of(tip_mm, np.stack([POINTING_DOWN] * 2), instrument_of("400006"))
-    assert _nearest_limit(tip_mm, solutions, instrument_of("400006")).tip_mm == (0.0, 0.0, -400.0)
+    solutions = kinematics.solutions_of(
+        tip_mm, np.stack([kinematics.POINTING_DOWN] * 2), kinematics.instrument_of("400006")
+    )
+    assert kinematics._nearest_limit(tip_mm, solutions, kinematics.instrument_of("400006")).tip_mm == (0.0, 0.0, -400.0)
     solutions[1] = np.nan
-    nearest = _nearest_limit(tip_mm, solutions, instrument_of("400006"))
+    nearest = kinematics._nearest_limit(tip_mm, solutions, kinematics.instrument_of("400006"))
     assert nearest.tip_mm == (0.0, 50.0, -120.0)
     assert nearest.value is nearest.margin is None

@@ -8,23 +8,11 @@ import numpy as np
 import pytest
 
 from skills.errors import BadInput
-from skills.scoring.calibration import (
-    LEVELS,
-    Cohort,
-    Design,
-    SkillModel,
-    as_numbers,
-    calibrate,
-    designs_of,
-    from_numbers,
-    held_out,
-    left_out_scores,
-    rank_correlations,
-)
+from skills.scoring import calibration
 from tests.scoring.cohorts import cohort
 
 
-def fitted_by_sklearn(drawn: Cohort, inside: np.ndarray, design: Design) -> np.ndarray:
+def fitted_by_sklearn(drawn: calibration.Cohort, inside: np.ndarray, design: calibration.Design) -> np.ndarray:
     """Return the scores of all trials by scikit-learn, as one would write it: shape (N,)."""
     from sklearn.linear_model import Ridge  # here, because the import takes a second
 
@@ -49,8 +37,8 @@ def fitted_by_sklearn(drawn: Cohort, inside: np.ndarray, design: Design) -> np.n
 @pytest.mark.parametrize(("tasks", "sides"), [(1, 1), (2, 2)])
 def test_scores_of_surgeons_left_out_are_those_of_scikit_learn(tasks: int, sides: int) -> None:
     drawn = cohort(tasks=tasks, sides=sides, surgeons=5, trials=3)
-    found = left_out_scores(drawn, drawn.surgeons, drawn.ratings[:, :1, None])
-    designs = designs_of(drawn)
+    found = calibration.left_out_scores(drawn, drawn.surgeons, drawn.ratings[:, :1, None])
+    designs = calibration.designs_of(drawn)
     assert len(designs) == 3 * tasks * sides
     for surgeon, (best,) in enumerate(found.chosen):
         out = drawn.surgeons == surgeon
@@ -60,8 +48,8 @@ def test_scores_of_surgeons_left_out_are_those_of_scikit_learn(tasks: int, sides
 
 def test_the_chosen_design_is_the_best_on_the_other_surgeons() -> None:
     drawn = cohort(seed=2, tasks=2, surgeons=4, trials=3)
-    designs = designs_of(drawn)
-    found = left_out_scores(drawn, drawn.surgeons, drawn.ratings[:, :1, None])
+    designs = calibration.designs_of(drawn)
+    found = calibration.left_out_scores(drawn, drawn.surgeons, drawn.ratings[:, :1, None])
     for out, (best,) in enumerate(found.chosen[:2]):
         rhos = []
         for number, design in enumerate(designs):
@@ -72,7 +60,9 @@ def test_the_chosen_design_is_the_best_on_the_other_surgeons() -> None:
             if number == best:
                 np.testing.assert_allclose(found.inner[out, :, 0], scores, atol=1e-9)
             rows = [of_task[drawn.surgeons[of_task] != out] for of_task in drawn.by_task]
-            rhos.append(np.mean([rank_correlations(scores[None, one], drawn.ratings[one, 0])[0] for one in rows]))
+            rhos.append(
+                np.mean([calibration.rank_correlations(scores[None, one], drawn.ratings[one, 0])[0] for one in rows])
+            )
         assert rhos[best] == pytest.approx(max(rhos))
 
 
@@ -82,7 +72,7 @@ def test_a_surgeon_left_out_is_not_seen() -> None:
     mine = drawn.surgeons == 3
     ratings = np.where(mine[:, None], [6.0, *[1.0] * 6], drawn.ratings)
     lied = replace(drawn, ratings=ratings, levels=np.where(mine, 0, drawn.levels))
-    one, other = held_out(drawn), held_out(lied)
+    one, other = calibration.held_out(drawn), calibration.held_out(lied)
     for of_one, of_other in ((one.scores, other.scores), (one.ratings, other.ratings), (one.levels, other.levels)):
         np.testing.assert_array_equal(of_one[mine], of_other[mine])
     assert (one.scores[~mine, 0] != other.scores[~mine, 0]).all()
@@ -93,9 +83,9 @@ def test_variants_are_predicted_as_each_alone() -> None:
     rng = np.random.default_rng(1)
     several = np.stack([drawn.ratings[rng.permutation(25), :1] for _ in range(3)], axis=2)
     levels = np.stack([drawn.levels, drawn.levels[::-1], drawn.levels], axis=1)
-    together = held_out(drawn, several, levels)
+    together = calibration.held_out(drawn, several, levels)
     for variant in range(3):
-        alone = held_out(drawn, several[:, :, variant : variant + 1], levels[:, variant : variant + 1])
+        alone = calibration.held_out(drawn, several[:, :, variant : variant + 1], levels[:, variant : variant + 1])
         np.testing.assert_allclose(together.scores[:, :, variant], alone.scores[:, :, 0], atol=1e-12)
         np.testing.assert_array_equal(together.levels[:, variant], alone.levels[:, 0])
 
@@ -104,20 +94,20 @@ def test_a_task_without_a_trial_in_the_fit_is_scored_as_average() -> None:
     """With one repetition in a task, none is left when it is left out."""
     drawn = cohort(tasks=2, surgeons=5, trials=3)
     once = replace(drawn, repetitions=np.where(drawn.tasks == 1, 0, drawn.repetitions))
-    scores = left_out_scores(once, once.repetitions, once.ratings[:, :1, None]).scores
+    scores = calibration.left_out_scores(once, once.repetitions, once.ratings[:, :1, None]).scores
     np.testing.assert_array_equal(scores[once.tasks == 1], 0.0)
     assert (scores[once.tasks == 0] != 0.0).all()
 
 
 def test_the_model_rates_in_points_and_the_levels_are_the_nearest() -> None:
     drawn = cohort(surgeons=10)
-    found = held_out(drawn)
-    model = calibrate(drawn, found)
+    found = calibration.held_out(drawn)
+    model = calibration.calibrate(drawn, found)
     predicted = model.ratings(0, drawn.figures(model.masters))
     assert np.abs(predicted[:, 0] - drawn.ratings[:, 0]).mean() < 0.5 * drawn.ratings[:, 0].std()
-    assert rank_correlations(predicted[:, 0][None], drawn.ratings[:, 0])[0] > 0.9
+    assert calibration.rank_correlations(predicted[:, 0][None], drawn.ratings[:, 0])[0] > 0.9
     np.testing.assert_allclose(model.ratings(0, model.centre)[0, 0], drawn.ratings[:, 0].mean())
-    mean = [drawn.ratings[drawn.levels == level, 0].mean() for level in range(len(LEVELS))]
+    mean = [drawn.ratings[drawn.levels == level, 0].mean() for level in range(len(calibration.LEVELS))]
     np.testing.assert_allclose(model.level_ratings[0], mean)
     np.testing.assert_allclose(model.level_shares[0].sum(axis=1), 1.0)
     right = (found.levels[:, 0] == drawn.levels).mean()
@@ -128,7 +118,7 @@ def test_the_model_rates_in_points_and_the_levels_are_the_nearest() -> None:
 
 def test_ratings_stay_in_their_range() -> None:
     drawn = cohort()
-    model = calibrate(drawn, held_out(drawn))
+    model = calibration.calibrate(drawn, calibration.held_out(drawn))
     far = model.centre[0] + 100.0 * np.sign(model.weights[0, 0]) * model.scale[0]
     best, worst = model.ratings(0, far), model.ratings(0, 2 * model.centre[0] - far)
     assert best[0] == 30.0 and worst[0] == 6.0
@@ -140,7 +130,7 @@ def test_a_figure_that_never_varies_weighs_nothing() -> None:
     values = drawn.values.copy()
     values[:, :, 4] = 0.1
     still = replace(drawn, values=values)
-    model = calibrate(still, held_out(still))
+    model = calibration.calibrate(still, calibration.held_out(still))
     np.testing.assert_allclose(model.weights[0, :, 4], 0.0, atol=1e-12)
 
 
@@ -150,22 +140,22 @@ def test_rank_correlation_is_that_of_scipy_ties_included() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):
         one, other = rng.integers(0, 6, 15).astype(float), rng.integers(0, 6, 15).astype(float)
-        assert rank_correlations(one[None], other)[0] == pytest.approx(spearmanr(one, other).statistic)
-    assert rank_correlations(np.ones((1, 4)), np.arange(4.0))[0] == 0.0
+        assert calibration.rank_correlations(one[None], other)[0] == pytest.approx(spearmanr(one, other).statistic)
+    assert calibration.rank_correlations(np.ones((1, 4)), np.arange(4.0))[0] == 0.0
 
 
 def test_every_bit_of_a_model_survives_as_numbers() -> None:
     drawn = cohort(tasks=2)
-    model = calibrate(drawn, held_out(drawn))
-    again = from_numbers(json.loads(json.dumps(as_numbers(model))))
-    assert as_numbers(again) == as_numbers(model)
+    model = calibration.calibrate(drawn, calibration.held_out(drawn))
+    again = calibration.from_numbers(json.loads(json.dumps(calibration.as_numbers(model))))
+    assert calibration.as_numbers(again) == calibration.as_numbers(model)
 
 
 @pytest.mark.parametrize("wrong", [{"centre": [[1.0]]}, {"margins": [np.nan]}, {"means": [[1.0] * 6]}])
 def test_numbers_that_are_no_model_are_refused(wrong: dict[str, Any]) -> None:
     drawn = cohort()
     with pytest.raises(BadInput):
-        SkillModel(**vars(calibrate(drawn, held_out(drawn))) | wrong)
+        calibration.SkillModel(**vars(calibration.calibrate(drawn, calibration.held_out(drawn))) | wrong)
 
 
 @pytest.mark.parametrize(

@@ -225,7 +225,7 @@ def test_a_mistake_of_planning_is_found_by_the_service(databases, monkeypatch):
     found = played(database, cases.add_plan(database, psm_m={"approach": PSM_M})).report
     assert (found.feasible, found.failure.quantity) == (False, "A2 off the paper's hand-off")
     assert found.failure.value == pytest.approx(30.0)
-    assert "A2 off the paper's hand-off is 30 deg, the limit is 0.1" in found.failure_in_words
+    assert "A2 off the paper's hand-off is 30 deg, the limit is 0.1" in found.failure_sentence
 
 
 def test_a_policy_withdrawn_after_planning_is_told_with_the_playback(databases):

@@ -25,7 +25,7 @@ HALF = np.radians(45) / 2
 BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(HALF)), float(np.cos(HALF))))  # invented
 FEASIBLE = {
     "failure": None,
-    "failure_in_words": None,
+    "failure_sentence": None,
     "settings": {"clearance_pad_mm": 1.0, "clearance_psm_m_mm": 0.5},
 }
 ALONE = small_trajectory(rate_hz=100.0)
@@ -121,7 +121,7 @@ def test_an_arm_alone_has_its_distance_to_the_pad_only():
 
 def test_the_first_sample_that_fails_is_marked_in_every_panel_and_said():
     words = "Pass 1, A1, sample 500: clearance of PSM_A finger_1 to the pad is 0.4 mm, the limit is 1."
-    report = FEASIBLE | {"failure": {"sample": 500}, "failure_in_words": words}
+    report = FEASIBLE | {"failure": {"sample": 500}, "failure_sentence": words}
     failed_s = ALONE.stamps_s[500] - ALONE.stamps_s[0]
     for draw in (pictures.draw_joints, pictures.draw_clearance):
         figure = draw(ALONE, measured(ALONE), report)
@@ -134,7 +134,7 @@ def test_the_first_sample_that_fails_is_marked_in_every_panel_and_said():
 @pytest.mark.nightly  # rarely breaks
 def test_the_same_playback_gives_the_same_picture_and_nothing_is_cut_off():
     motion = both_arms()
-    report = FEASIBLE | {"failure": {"sample": 500}, "failure_in_words": "Pass 1 ..."}
+    report = FEASIBLE | {"failure": {"sample": 500}, "failure_sentence": "Pass 1 ..."}
     for draw in (pictures.draw_joints, pictures.draw_clearance):
         png = pictures.png(draw(motion, measured(motion), report))
         assert pictures.png(draw(motion, measured(motion), report)) == png

@@ -7,14 +7,10 @@ import numpy as np
 import pytest
 
 from skills.kinematics import INSTRUMENTS, angle_between, forward, instrument_of, inverse, matrix_of
+from skills.simulation import simulator
 from skills.verification.playback import LINKS, PAD_SIZE_MM
-from tests.needs import need
 
-need("simulator")
-
-import pybullet  # noqa: E402 - after the skip
-
-from skills.simulation import simulator  # noqa: E402
+pytestmark = pytest.mark.needs("simulator")
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +47,7 @@ def test_six_joints_put_at_once_are_where_six_calls_put_them(opened):
         opened.pose(joints)
         together = opened.frame_of(opened.arm, opened.arm.tool)
         for index, value in zip(opened.arm.joints, simulator.in_metres(joints).tolist(), strict=True):
-            pybullet.resetJointState(opened.arm.number, index, value, physicsClientId=opened.client)
+            opened.bullet.resetJointState(opened.arm.number, index, value)
         assert opened.frame_of(opened.arm, opened.arm.tool) == together
 
 
@@ -64,7 +60,7 @@ def test_pybullets_inverse_kinematics_agrees_once_its_damping_is_removed(opened)
         opened.pose(joints[k])
         _, quaternion = opened.read_tip()
         opened.pose(joints[k] + [0.02, -0.02, 1.0, 0.02, 0.02, -0.02])
-        found = pybullet.calculateInverseKinematics(
+        found = opened.bullet.calculateInverseKinematics(
             opened.arm.number,
             opened.arm.tool,
             (tip_mm[k] / 1000).tolist(),
@@ -72,7 +68,6 @@ def test_pybullets_inverse_kinematics_agrees_once_its_damping_is_removed(opened)
             jointDamping=[1e-6] * 8,
             maxNumIterations=100,
             residualThreshold=1e-9,
-            physicsClientId=opened.client,
         )
         theirs = np.array(found[:6]) * [1, 1, 1000, 1, 1, 1]
         assert np.abs(theirs - ours[k]).max() < 1e-3  # rad and mm
@@ -80,7 +75,7 @@ def test_pybullets_inverse_kinematics_agrees_once_its_damping_is_removed(opened)
 
 def test_the_files_limits_are_the_closed_forms(opened):
     for joint, index in enumerate(opened.arm.joints):
-        info = pybullet.getJointInfo(opened.arm.number, index, physicsClientId=opened.client)
+        info = opened.bullet.getJointInfo(opened.arm.number, index)
         scale = 1000.0 if joint == 2 else 1.0
         assert info[8] * scale == pytest.approx(instrument_of("400006").lower[joint], abs=1e-6)
         assert info[9] * scale == pytest.approx(instrument_of("400006").upper[joint], abs=1e-6)
@@ -91,22 +86,18 @@ def test_the_shaft_passes_through_the_remote_centre(opened):
     roll = opened.arm.joints[3]
     for joints in joints_anywhere(20):
         opened.pose(joints)
-        state = pybullet.getLinkState(
-            opened.arm.number, roll, computeForwardKinematics=1, physicsClientId=opened.client
-        )
-        along = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)[:, 2]
+        state = opened.bullet.getLinkState(opened.arm.number, roll, computeForwardKinematics=1)
+        along = np.array(opened.bullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)[:, 2]
         assert np.linalg.norm(np.cross(state[4], along)) * 1000 < 1e-4  # mm off the line
 
 
 def test_the_finger_tips_are_a_centimetre_beyond_the_tip(opened):
     opened.pose(np.array([0.0, 0.0, 150.0, 0.0, 0.0, 0.0]))
     by_link = {
-        pybullet.getJointInfo(opened.arm.number, k, physicsClientId=opened.client)[12].decode(): k
-        for k in range(pybullet.getNumJoints(opened.arm.number, physicsClientId=opened.client))
+        opened.bullet.getJointInfo(opened.arm.number, k)[12].decode(): k
+        for k in range(opened.bullet.getNumJoints(opened.arm.number))
     }
-    state = pybullet.getLinkState(
-        opened.arm.number, by_link["jaw_tip"], computeForwardKinematics=1, physicsClientId=opened.client
-    )
+    state = opened.bullet.getLinkState(opened.arm.number, by_link["jaw_tip"], computeForwardKinematics=1)
     tip_mm, _ = opened.read_tip()
     np.testing.assert_allclose(np.array(state[4]) * 1000 - tip_mm, [0, 0, -10.2], atol=1e-4)
 
@@ -136,7 +127,7 @@ def test_distances_to_the_pad_are_those_of_the_capsules_lowest_points():
 
 def test_distances_between_arms_are_those_of_the_capsules_axes():
     with simulator.opened("400006", 240.0) as one:
-        one.place_psm_m(np.array([50.0, 10.0, 0.0]), np.array([0.0, 0.17, 0.0, 0.985444]))
+        one.place_psm_m(np.array([50.0, 10.0, 0.0]), np.array([0.0, 0.17, 0.0, 0.985444]), instrument_of("400006"))
         assert one.psm_m is not None
         rng = np.random.default_rng(6)
         for _ in range(40):
@@ -177,7 +168,7 @@ def test_the_pad_is_as_large_as_the_needles_closed_form_takes_it():
     with simulator.opened("400006", 240.0) as one:
         for width, scale in ((10.0, 1.0), (200.0, 2.0)):
             one.place_pad(np.array([[0.0, 0.0, 0.0], [0.0, width, 0.0]]), -150.0)
-            [shape] = pybullet.getCollisionShapeData(one.pad, -1, physicsClientId=one.client)
+            [shape] = one.bullet.getCollisionShapeData(one.pad, -1)
             np.testing.assert_allclose(np.array(shape[3]) * 1000, np.array(PAD_SIZE_MM) * scale, atol=1e-6)
 
 

@@ -12,20 +12,8 @@ from hypothesis import strategies as st
 from skills.kinematics import instrument_of, matrix_of
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.trajectory import A1, Trajectory, time_parametrise
+from skills.verification import bodies
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
-from skills.verification.bodies import (
-    BODIES,
-    LOOK_MM,
-    between,
-    bodies_clearance,
-    distances_at,
-    moved_mm,
-    names_of,
-    parts_of,
-    radii_of,
-    segments_apart,
-    too_near,
-)
 from skills.verification.clearance import Links, links_of
 from skills.verification.error_draws import draw
 from skills.verification.gates import Limits
@@ -59,9 +47,9 @@ def anywhere(tool: str, count: int, seed: int) -> np.ndarray:
 
 def apart(one: Trajectory, sample: slice | np.ndarray = np.s_[:]) -> np.ndarray:
     m = one.psm_m
-    other = parts_of(m.joints[sample], m.instrument).seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm)
-    arm = parts_of(one.joints[sample], one.instrument)
-    return between(arm, radii_of(one.instrument), other, radii_of(m.instrument))
+    other = bodies.parts_of(m.joints[sample], m.instrument).seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm)
+    arm = bodies.parts_of(one.joints[sample], one.instrument)
+    return bodies.between(arm, bodies.radii_of(one.instrument), other, bodies.radii_of(m.instrument))
 
 
 # ---- where the bodies are ------------------------------------------------------------------------------------------
@@ -70,7 +58,7 @@ def apart(one: Trajectory, sample: slice | np.ndarray = np.s_[:]) -> np.ndarray:
 @pytest.mark.parametrize("tool", TOOLS)
 def test_shaft_and_hand_are_those_of_the_tool(tool):
     joints = anywhere(tool, 200, seed=1)
-    parts, links = parts_of(joints, tool), links_of(joints, tool)
+    parts, links = bodies.parts_of(joints, tool), links_of(joints, tool)
     np.testing.assert_allclose(parts.begin_mm[:, -2:], links.begin_mm[:, :2], atol=1e-9)
     np.testing.assert_allclose(parts.end_mm[:, -2:], links.end_mm[:, :2], atol=1e-9)
 
@@ -86,15 +74,15 @@ def test_shaft_and_hand_are_those_of_the_tool(tool):
     ],
 )
 def test_the_insertion_axis_and_its_carriage_turn_and_slide_by_hand(yaw, pitch, insertion, low, high):
-    parts, names = parts_of(np.array([[yaw, pitch, insertion, 0, 0, 0]]), "400006"), names_of("400006")
+    parts, names = bodies.parts_of(np.array([[yaw, pitch, insertion, 0, 0, 0]]), "400006"), bodies.names_of("400006")
     np.testing.assert_allclose(parts.begin_mm[0, names.index("insertion axis")], low, atol=1e-9)
     np.testing.assert_allclose(parts.begin_mm[0, names.index("carriage")], high, atol=1e-9)
 
 
 @pytest.mark.parametrize("tool", TOOLS[:2])
 def test_the_bars_keep_their_direction_and_what_is_mounted_stands_still(tool):
-    joints, names = anywhere(tool, 100, seed=2), names_of(tool)
-    parts = parts_of(joints, tool)
+    joints, names = anywhere(tool, 100, seed=2), bodies.names_of(tool)
+    parts = bodies.parts_of(joints, tool)
     bars = names.index("bars")
     for still in ("setup joint end", "base"):
         assert np.ptp(parts.begin_mm[:, names.index(still)], axis=0).max() == 0.0
@@ -111,14 +99,14 @@ def test_no_two_parts_approach_by_more_than_the_bound_of_their_movements(seed, s
     poses = [anywhere(tool, 20, seed), anywhere(tool, 20, seed + 1)]
     others = [q + size * rng.uniform(-1, 1, q.shape) * [1, 1, 100, 1, 1, 1] for q in poses]
     base = matrix_of(rng.normal(size=(1, 4)))[0]
-    at_mm, radii = rng.uniform(-400, 400, 3), radii_of(tool)
+    at_mm, radii = rng.uniform(-400, 400, 3), bodies.radii_of(tool)
     of = instrument_of(tool)
     others = [np.clip(q, of.lower, of.upper) for q in others]
     seen = [
-        between(parts_of(one, tool), radii, parts_of(two, tool).seen_from(base, at_mm), radii)
+        bodies.between(bodies.parts_of(one, tool), radii, bodies.parts_of(two, tool).seen_from(base, at_mm), radii)
         for one, two in (poses, others)
     ]
-    moved = [moved_mm(one, two, tool) for one, two in zip(poses, others, strict=True)]
+    moved = [bodies.moved_mm(one, two, tool) for one, two in zip(poses, others, strict=True)]
     way = moved[0][:, :, None] + moved[1][:, None]
     between_tools = np.isinf(seen[0])
     first, second = (np.where(between_tools, 0.0, one) for one in seen)
@@ -133,10 +121,10 @@ def test_distances_of_segments_are_those_of_their_points():
     share = np.linspace(0, 1, 201)[:, None]
     points = [(a[:, None] + share * b[:, None]) for a, b in ((p, u), (q, v))]
     grid = np.linalg.norm(points[0][:, :, None] - points[1][:, None], axis=-1).min(axis=(1, 2))
-    ours = segments_apart(p, u, q, v)
+    ours = bodies.segments_apart(p, u, q, v)
     assert (ours <= grid + 1e-9).all()
     np.testing.assert_allclose(ours, grid, atol=3.0)
-    assert np.isnan(segments_apart(np.full((1, 3), np.nan), u[:1], q[:1], v[:1])).all()
+    assert np.isnan(bodies.segments_apart(np.full((1, 3), np.nan), u[:1], q[:1], v[:1])).all()
 
 
 # ---- along a motion ------------------------------------------------------------------------------------------------
@@ -145,22 +133,22 @@ def test_distances_of_segments_are_those_of_their_points():
 @pytest.mark.parametrize(("further_mm", "free"), [(0.0, False), (60.0, False), (80.0, False), (100.0, True)])
 def test_two_arms_side_by_side_are_free_where_they_were_measured_to_be(further_mm, free):
     """The manufacturer's bodies overlap at 160 and 240 mm, and are 11 mm apart at 260; ours are never further apart."""
-    arm = parts_of(np.zeros((1, 6)), "400006")
+    arm = bodies.parts_of(np.zeros((1, 6)), "400006")
     other = arm.seen_from(matrix_of(np.array([SIDE_BY_SIDE]))[0], np.array([160.0 + further_mm, 20.0, 20.0]))
-    least = between(arm, radii_of("400006"), other, radii_of("400006")).min()
+    least = bodies.between(arm, bodies.radii_of("400006"), other, bodies.radii_of("400006")).min()
     assert (least > 0) == free
     assert least < 11.0
 
 
 @pytest.mark.parametrize("one", [FREE, JAMMED], ids=["free", "jammed"])
 def test_the_bound_holds_at_every_sample_and_the_first_pair_is_the_first(one):
-    found, every = bodies_clearance(one, LIMIT_MM), apart(one).min(axis=(1, 2))
+    found, every = bodies.bodies_clearance(one, LIMIT_MM), apart(one).min(axis=(1, 2))
     assert found.report.at_least_mm <= every.min()
-    assert found.report.at_least_mm >= every.min() - LOOK_MM
+    assert found.report.at_least_mm >= every.min() - bodies.LOOK_MM
     assert (found.first is None) == bool((every >= LIMIT_MM).all())
     assert found.report.looks < len(one)
     for near in found.report.nearest:
-        pair = names_of("400006").index(near.part), names_of("400006").index(near.other)
+        pair = bodies.names_of("400006").index(near.part), bodies.names_of("400006").index(near.other)
         assert near.least_mm == pytest.approx(apart(one, np.array([near.sample]))[0][pair])
 
 
@@ -173,10 +161,13 @@ def test_a_single_sample_that_is_too_near_is_found_and_named():
     swung = replace(FREE, psm_m=OtherArm(m.base_mm, m.base_xyzw, m.instrument, joints))
     every = apart(swung).min(axis=(1, 2))
     assert np.flatnonzero(~(every >= LIMIT_MM)).tolist() == [sample]
-    found = bodies_clearance(swung, LIMIT_MM)
+    found = bodies.bodies_clearance(swung, LIMIT_MM)
     assert int(np.argmax(~(found.at_least_mm >= LIMIT_MM))) in (sample - 1, sample)
     pair = np.unravel_index(apart(swung)[sample].argmin(), (12, 12))
-    assert str(found.first) == f"PSM_A's {names_of('400006')[pair[0]]} and PSM_M's {names_of('400006')[pair[1]]}"
+    assert (
+        str(found.first)
+        == f"PSM_A's {bodies.names_of('400006')[pair[0]]} and PSM_M's {bodies.names_of('400006')[pair[1]]}"
+    )
 
 
 def playback(one: Trajectory):
@@ -192,7 +183,7 @@ def test_the_judge_refuses_arms_whose_bodies_meet_at_the_first_sample():
     report = judge(playback(JAMMED), JAMMED)
     assert (report.feasible, report.failure.sample) == (False, 0)
     assert report.failure.quantity == "clearance of PSM_A's yaw link and PSM_M's yaw link"
-    assert report.failure.value == pytest.approx(report.bodies.at_least_mm, abs=LOOK_MM)
+    assert report.failure.value == pytest.approx(report.bodies.at_least_mm, abs=bodies.LOOK_MM)
     assert report.bodies.arms == ("PSM Classic", "PSM Classic")
 
 
@@ -207,14 +198,14 @@ def test_joints_that_are_not_numbers_are_too_near():
     joints[7, 1] = np.nan
     unknown = replace(FREE, psm_m=OtherArm(m.base_mm, m.base_xyzw, m.instrument, FREE.psm_m.joints))
     object.__setattr__(unknown.psm_m, "joints", joints)
-    found = bodies_clearance(unknown, LIMIT_MM)
+    found = bodies.bodies_clearance(unknown, LIMIT_MM)
     assert int(np.argmax(~(found.at_least_mm >= LIMIT_MM))) in (6, 7)
 
 
 def test_the_bodies_of_both_generations_have_names_of_their_own():
-    assert set(BODIES) == {"PSM Classic", "PSM Si"}
+    assert set(bodies.BODIES) == {"PSM Classic", "PSM Si"}
     for tool in TOOLS:
-        assert len(set(names_of(tool))) == len(names_of(tool)) == len(radii_of(tool))
+        assert len(set(bodies.names_of(tool))) == len(bodies.names_of(tool)) == len(bodies.radii_of(tool))
 
 
 # ---- in inexact worlds ---------------------------------------------------------------------------------------------
@@ -242,7 +233,7 @@ def test_a_variation_is_too_near_where_its_own_distances_say_so(limit_mm):
     expected = []
     for errors in displaced:
         a, m = (
-            parts_of(q, arm.instrument).seen_from(arm.base, arm.base_mm)
+            bodies.parts_of(q, arm.instrument).seen_from(arm.base, arm.base_mm)
             for q, arm in zip(joints, scene.arms, strict=True)
         )
         by_a, by_m = (one.reshape(-1, 1, 3) for one in errors.tip_mm)
@@ -252,13 +243,15 @@ def test_a_variation_is_too_near_where_its_own_distances_say_so(limit_mm):
         a = replace(a, begin_mm=a.begin_mm + by_a, end_mm=a.end_mm + by_a)
         begin, end = (np.einsum("tij,tkj->tki", turn, one - centre) + centre + by_m for one in (m.begin_mm, m.end_mm))
         moved = replace(m, begin_mm=begin, end_mm=end)
-        least = between(a, radii_of("400006"), moved, radii_of("400006")).reshape(40, -1).min(axis=1)
+        least = (
+            bodies.between(a, bodies.radii_of("400006"), moved, bodies.radii_of("400006")).reshape(40, -1).min(axis=1)
+        )
         expected.append(least < limit_mm)
     every = np.ones((3, 40), dtype=bool)
-    found = too_near(scene.arms, joints, displaced, limit_mm, every)
+    found = bodies.too_near(scene.arms, joints, displaced, limit_mm, every)
     np.testing.assert_array_equal(found, expected)
     some = np.random.default_rng(0).random((3, 40)) < 0.5
-    np.testing.assert_array_equal(too_near(scene.arms, joints, displaced, limit_mm, some), found & some)
+    np.testing.assert_array_equal(bodies.too_near(scene.arms, joints, displaced, limit_mm, some), found & some)
 
 
 need("fcl")
@@ -283,15 +276,15 @@ def set_up(number: int) -> SetUp:
     tools = [ENGINE_TOOLS[k] for k in rng.integers(0, 2, 2)]
     limits = [instrument_of(tool) for tool in tools]
     joints = [rng.uniform(one.lower, one.upper)[None] for one in limits]
-    arms = [parts_of(q, tool) for q, tool in zip(joints, tools, strict=True)]
-    radii = (radii_of(tools[0]), radii_of(tools[1]))
+    arms = [bodies.parts_of(q, tool) for q, tool in zip(joints, tools, strict=True)]
+    radii = (bodies.radii_of(tools[0]), bodies.radii_of(tools[1]))
     turn, lean, towards = rng.uniform(0, 2 * np.pi), rng.uniform(0, np.radians(30)), rng.uniform(0, 2 * np.pi)
     about = np.array([np.cos(towards), np.sin(towards), 0.0]) * np.sin(lean / 2)
     upright = matrix_of(np.array([[0, 0, np.sin(turn / 2), np.cos(turn / 2)], [*about, np.cos(lean / 2)]]))
     base, way = upright[1] @ upright[0], rng.uniform(-400, 400, 3) * [1, 1, 0.5]
 
     def least(share: float) -> float:
-        return float(between(arms[0], radii[0], arms[1].seen_from(base, share * way), radii[1]).min())
+        return float(bodies.between(arms[0], radii[0], arms[1].seen_from(base, share * way), radii[1]).min())
 
     share = 1.0
     if number % 3 == 0:
@@ -367,16 +360,16 @@ def planned_motions() -> Iterator[Trajectory]:
             share = (near + far) / 2
             base_mm = motion.psm_m.base_mm * [share, share, 1.0]
             moved = replace(motion, psm_m=replace(motion.psm_m, base_mm=base_mm))
-            near, far = (share, far) if distances_at(moved, some).min() < wanted else (near, share)
+            near, far = (share, far) if bodies.distances_at(moved, some).min() < wanted else (near, share)
         yield moved
 
 
 def at_sample(motion: Trajectory, sample: int) -> SetUp:
     arm, other = motion, motion.psm_m
-    parts = [parts_of(one.joints[[sample]], one.instrument) for one in (arm, other)]
+    parts = [bodies.parts_of(one.joints[[sample]], one.instrument) for one in (arm, other)]
     parts[1] = parts[1].seen_from(matrix_of(other.base_xyzw[None])[0], other.base_mm)
-    least_mm = float(distances_at(motion, np.array([sample])).min())
-    return SetUp((parts[0], parts[1]), (radii_of(arm.instrument), radii_of(other.instrument)), least_mm)
+    least_mm = float(bodies.distances_at(motion, np.array([sample])).min())
+    return SetUp((parts[0], parts[1]), (bodies.radii_of(arm.instrument), bodies.radii_of(other.instrument)), least_mm)
 
 
 def compare_motions(count: int) -> tuple[int, int]:
@@ -387,9 +380,9 @@ def compare_motions(count: int) -> tuple[int, int]:
     """
     collide = near = 0
     for _, motion in zip(range(count), planned_motions(), strict=False):
-        verdict = bodies_clearance(motion, 0.0)
+        verdict = bodies.bodies_clearance(motion, 0.0)
         every = np.linspace(0, len(motion) - 1, 60).astype(int)
-        nearest = int(every[distances_at(motion, every).min(axis=(1, 2)).argmin()])
+        nearest = int(every[bodies.distances_at(motion, every).min(axis=(1, 2)).argmin()])
         looks = {*every.tolist(), *range(max(nearest - 5, 0), min(nearest + 6, len(motion)))}
         if verdict.first is not None:
             looks.add(verdict.first.sample)

@@ -11,19 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
 
-from skills.kinematics import (
-    CANNULA_MM,
-    CLASSIC,
-    JAW_TIP_MM,
-    POINTING_DOWN,
-    WRIST_MM,
-    forward,
-    instrument_of,
-    inverse,
-    matrix_of,
-    quaternion_of,
-    reachable,
-)
+from skills import kinematics
 from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_RADIUS_MM, hand_off, realign
 from skills.planning.trajectory import TRANSFER, PassPath, time_parametrise
 from skills.verification.arm_errors import MEAN_LENGTH
@@ -57,13 +45,13 @@ from tests.planning.motions import small_trajectory
 STRAIGHT = np.array([[0.0, 0.0, 150.0, 0.0, 0.0, 0.0]])
 BESIDE_MM = np.array([20.0, 0.0, 0.0])
 BASE_MM = np.array([160.0, 20.0, 20.0])
-BASE = matrix_of([[0.0, np.sin(np.radians(35) / 2), 0.0, np.cos(np.radians(35) / 2)]])[0]
+BASE = kinematics.matrix_of([[0.0, np.sin(np.radians(35) / 2), 0.0, np.cos(np.radians(35) / 2)]])[0]
 
 
 def joints_anywhere(count: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    joints = rng.uniform(CLASSIC.lower, CLASSIC.upper, (count, 6))
-    joints[:, 2] = rng.uniform(CANNULA_MM, CLASSIC.upper[2], count)
+    joints = rng.uniform(kinematics.CLASSIC.lower, kinematics.CLASSIC.upper, (count, 6))
+    joints[:, 2] = rng.uniform(kinematics.CANNULA_MM, kinematics.CLASSIC.upper[2], count)
     return joints
 
 
@@ -71,11 +59,14 @@ def two_arms(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return joints that bring both arms to one place, where some are in each other's way."""
     rng = np.random.default_rng(5)
     tip = rng.uniform([-30, 25, -140], [20, 75, -90], (40 * count, 3))
-    turned, turned_m = matrix_of(rng.normal(size=(40 * count, 4))), matrix_of(rng.normal(size=(40 * count, 4)))
+    turned, turned_m = (
+        kinematics.matrix_of(rng.normal(size=(40 * count, 4))),
+        kinematics.matrix_of(rng.normal(size=(40 * count, 4))),
+    )
     tip_m = (tip + rng.normal(size=tip.shape) * 15.0 - BASE_MM) @ BASE
-    both = np.flatnonzero(reachable(tip, turned) & reachable(tip_m, turned_m))[:count]
+    both = np.flatnonzero(kinematics.reachable(tip, turned) & kinematics.reachable(tip_m, turned_m))[:count]
     assert len(both) == count
-    return inverse(tip[both], turned[both]), inverse(tip_m[both], turned_m[both])
+    return kinematics.inverse(tip[both], turned[both]), kinematics.inverse(tip_m[both], turned_m[both])
 
 
 def test_an_arm_that_hangs_straight_down_is_measured_by_hand():
@@ -98,15 +89,15 @@ def test_each_pose_may_have_a_pad_of_its_own():
 @pytest.mark.parametrize("instrument", ["400006", "420006"])
 def test_the_links_are_where_the_forward_kinematics_has_the_tip(instrument):
     joints = joints_anywhere(100, seed=1)
-    tip, rotation = forward(joints, instrument)
+    tip, rotation = kinematics.forward(joints, instrument)
     arm = links_of(joints, instrument, opening_rad=0.2)
     np.testing.assert_allclose(arm.end_mm[:, 1], tip, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(arm.end_mm[:, 1] - arm.begin_mm[:, 1], axis=1), WRIST_MM)
+    np.testing.assert_allclose(np.linalg.norm(arm.end_mm[:, 1] - arm.begin_mm[:, 1], axis=1), kinematics.WRIST_MM)
     np.testing.assert_allclose(
         np.cross(arm.begin_mm[:, 0], arm.end_mm[:, 0]), 0, atol=1e-9
     )  # through the remote centre
     length = np.linalg.norm(arm.end_mm[:, 0] - arm.begin_mm[:, 0], axis=1)
-    np.testing.assert_allclose(length, instrument_of(instrument).shaft_mm)
+    np.testing.assert_allclose(length, kinematics.instrument_of(instrument).shaft_mm)
     in_jaw = np.einsum("tji,tkj->tki", rotation, arm.end_mm[:, FINGERS] - tip[:, None])
     sine, cosine = np.sin(0.2), np.cos(0.2)
     y, z = ASIDE_MM * cosine + FINGER_MM * sine, FINGER_MM * cosine - ASIDE_MM * sine
@@ -120,13 +111,13 @@ def test_the_capsules_are_those_of_the_urdf():
     }
     assert tuple(found) == LINKS
     sizes = {name: one.find("geometry/capsule").attrib for name, one in found.items()}
-    lengths = (instrument_of("400006").shaft_mm, WRIST_MM, FINGER_MM, FINGER_MM)
+    lengths = (kinematics.instrument_of("400006").shaft_mm, kinematics.WRIST_MM, FINGER_MM, FINGER_MM)
     for name, radius, length in zip(LINKS, RADII_MM, lengths, strict=True):
         assert float(sizes[name]["radius"]) * 1e3 == pytest.approx(radius)
         assert float(sizes[name]["length"]) * 1e3 == pytest.approx(length)
     finger = [float(x) * 1e3 for x in found["finger_1"].find("origin").get("xyz").split()]
     np.testing.assert_allclose(finger, [0, ASIDE_MM, FINGER_MM / 2], atol=1e-9)
-    assert pytest.approx(JAW_TIP_MM) == FINGER_MM + RADII_MM[2]
+    assert pytest.approx(kinematics.JAW_TIP_MM) == FINGER_MM + RADII_MM[2]
 
 
 @pytest.mark.parametrize("kind", ["anywhere", "parallel", "end to end", "crossing", "in one line"])
@@ -254,7 +245,7 @@ def drawn_errors(seed: int, count: int, needle_rad: float) -> tuple[Drawn, np.nd
 
 
 def planned_hand_off() -> HandOff:
-    jaw = realign(POINTING_DOWN, APPROACH).rotation
+    jaw = realign(kinematics.POINTING_DOWN, APPROACH).rotation
     tip = np.array([5.0, 55.0, -125.0])
     (tip_m,), (jaw_m,) = hand_off(tip[None], jaw[None], APPROACH)
     return HandOff(tip, jaw, tip_m, jaw_m)
@@ -335,7 +326,7 @@ def test_a_sampled_arc_crosses_the_jaws_at_the_same_place_and_angle():
         beside = NEEDLE_RADIUS_MM * min(phi[at, 0], NEEDLE_FREE_RAD - phi[at, 0]) - FINGER_RADIUS_MM
         depth, half = np.hypot(y, z), NEEDLE_THICK_MM / 2
         room = z * np.sin(OPENING_RAD) - y * np.cos(OPENING_RAD) - half
-        spare = min(beside, depth - WRIST_RADIUS_MM - half, JAW_TIP_MM - half - depth, room)
+        spare = min(beside, depth - WRIST_RADIUS_MM - half, kinematics.JAW_TIP_MM - half - depth, room)
         if abs(spare) > 0.01:
             assert between[k] == (spare > 0)
 
@@ -352,7 +343,7 @@ def test_the_angle_alone_fails_as_often_as_the_error_function_says():
 
 
 PAD_MM = np.array([0.0, 55.0, -150.0])
-LEVEL = time_parametrise([PassPath([[0, 55, -135], [0, 55, -130]], POINTING_DOWN)], rate_hz=60.0)
+LEVEL = time_parametrise([PassPath([[0, 55, -135], [0, 55, -130]], kinematics.POINTING_DOWN)], rate_hz=60.0)
 
 
 def test_a_downward_needle_lies_level_9_mm_below_the_hinge():
@@ -364,13 +355,13 @@ def test_a_downward_needle_lies_level_9_mm_below_the_hinge():
 def test_on_its_edge_it_reaches_down_as_far_as_its_arc_does(centre, lowest_mm):
     """Held along x, the approach along -y, the arc's centre above or below; two thirds of it are on one side."""
     upright = np.array([[centre, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, centre, 0.0]])
-    edge = replace(LEVEL, rotation_xyzw=np.tile(quaternion_of(upright[None]), (len(LEVEL), 1)))
+    edge = replace(LEVEL, rotation_xyzw=np.tile(kinematics.quaternion_of(upright[None]), (len(LEVEL), 1)))
     [found] = needle_to_pad_mm(edge, np.array([0]), PAD_MM)
     assert found == pytest.approx(15.0 - lowest_mm - 0.33, abs=1e-9)
 
 
 def test_inside_the_pad_it_is_negative():
-    level = time_parametrise([PassPath([[0, 55, -145], [0, 55, -140]], POINTING_DOWN)], rate_hz=60.0)
+    level = time_parametrise([PassPath([[0, 55, -145], [0, 55, -140]], kinematics.POINTING_DOWN)], rate_hz=60.0)
     assert needle_to_pad_mm(level, np.array([0]), PAD_MM)[0] == pytest.approx(-4.0 - 0.33, abs=1e-9)
 
 
@@ -388,7 +379,7 @@ def test_after_the_hand_off_the_needle_follows_psm_m_to_the_next_pass():
 
 def finger_ends(joints: np.ndarray) -> np.ndarray:
     """Return points all over both fingers' caps, shape (T, K, 3)."""
-    tip, rotation = forward(joints)
+    tip, rotation = kinematics.forward(joints)
     turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     opened = [np.array([0.0, side * (0.6 + 9.1 * np.sin(0.06)), 9.1 * np.cos(0.06)]) for side in (1, -1)]
     around = 1.1 * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
@@ -400,7 +391,7 @@ def finger_ends(joints: np.ndarray) -> np.ndarray:
 @given(st.integers(0, 2**32 - 1), st.floats(1e-4, 0.3))
 def test_no_point_of_a_finger_moves_further_than_the_bound(seed, step):
     rng = np.random.default_rng(seed)
-    joints = rng.uniform(CLASSIC.lower, CLASSIC.upper, (1, 6))
+    joints = rng.uniform(kinematics.CLASSIC.lower, kinematics.CLASSIC.upper, (1, 6))
     joints[:, 2] = rng.uniform(40.0, 240.0)
     joints = np.concatenate([joints, joints + rng.uniform(-step, step, 6) * [1, 1, 50, 1, 1, 1]])
     moved = np.linalg.norm(np.diff(finger_ends(joints), axis=0), axis=2).max()

@@ -14,16 +14,7 @@ import skills
 from skills.arithmetic import wilson
 from skills.errors import BadInput, BadSettings
 from skills.kinematics import JAW_TIP_MM, POINTING_DOWN, matrix_of
-from skills.planning.handoff import (
-    HOLDING_RAD,
-    JAW_CLOSED_RAD,
-    JAW_OPEN_RAD,
-    NEEDLE_FREE_RAD,
-    NEEDLE_RADIUS_MM,
-    OtherArm,
-    PsmM,
-    realign,
-)
+from skills.planning import handoff
 from skills.planning.passes import PassPath
 from skills.planning.trajectory import Trajectory, time_parametrise
 from skills.verification import monte_carlo, probabilities
@@ -41,18 +32,18 @@ from tests.verification.test_clearance import APPROACH, OPENING_RAD, PLANNED
 PAD_TOP_MM = -150.0  # 5 mm under the lowest finger tips
 BASE_MM = (160.0, 20.0, 20.0)
 BASE_XYZW = (0.0, 0.0, float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5))))
-PSM_M = PsmM(APPROACH, BASE_MM, BASE_XYZW)
+PSM_M = handoff.PsmM(APPROACH, BASE_MM, BASE_XYZW)
 PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10, 55, -120], [5, 55, -125]], dtype=float)
 NO_DOUBT = EstimateSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
 FEW = EstimateSettings(variations=100)
 
 
 def pass_path(shift_mm: float = 0.0, with_a2: bool = True) -> PassPath:
-    target = realign(POINTING_DOWN, APPROACH).rotation if with_a2 else None
+    target = handoff.realign(POINTING_DOWN, APPROACH).rotation if with_a2 else None
     return PassPath(PATH_MM + np.array([shift_mm, 0.0, 0.0]), POINTING_DOWN, target)
 
 
-def motion(passes: int = 1, psm_m: PsmM | None = None, with_a2: bool = True) -> Trajectory:
+def motion(passes: int = 1, psm_m: handoff.PsmM | None = None, with_a2: bool = True) -> Trajectory:
     paths = [pass_path(6.0 * k, with_a2) for k in range(passes)]
     return time_parametrise(paths, rate_hz=100.0, psm_m=psm_m)
 
@@ -93,14 +84,14 @@ def test_catching_is_as_likely_as_the_integral_over_all_offsets(errors):
     weight = np.exp(-(e**2) / 2)
     weight /= weight.sum()
     x, y, z = np.meshgrid(*[e * sigma] * 3, indexing="ij")
-    phi = np.arccos(np.clip(-x / NEEDLE_RADIUS_MM, -1, 1))
-    depth = 7.0 + z + NEEDLE_RADIUS_MM * (1 - np.sin(phi))
+    phi = np.arccos(np.clip(-x / handoff.NEEDLE_RADIUS_MM, -1, 1))
+    depth = 7.0 + z + handoff.NEEDLE_RADIUS_MM * (1 - np.sin(phi))
     rho, half = np.hypot(y, depth), NEEDLE_THICK_MM / 2
-    beside = FINGER_RADIUS_MM / NEEDLE_RADIUS_MM
-    good = (np.abs(x) < NEEDLE_RADIUS_MM) & (phi >= beside) & (phi <= NEEDLE_FREE_RAD - beside)
+    beside = FINGER_RADIUS_MM / handoff.NEEDLE_RADIUS_MM
+    good = (np.abs(x) < handoff.NEEDLE_RADIUS_MM) & (phi >= beside) & (phi <= handoff.NEEDLE_FREE_RAD - beside)
     good &= (rho >= WRIST_RADIUS_MM + half) & (rho <= JAW_TIP_MM - half)
     good &= np.abs(y) * np.cos(OPENING_RAD) + half <= depth * np.sin(OPENING_RAD)
-    good &= np.abs(x) <= NEEDLE_RADIUS_MM * np.sin(radians(15))
+    good &= np.abs(x) <= handoff.NEEDLE_RADIUS_MM * np.sin(radians(15))
     expected = np.einsum("ijk,i,j,k", good.astype(float), weight, weight, weight)
     settings = EstimateSettings(variations=2000, needle_rad=0.0)
     caught = under(judged(motion(1), settings=settings, errors=errors)).passes[0].caught
@@ -130,7 +121,7 @@ def test_a_plan_into_the_pad_never_succeeds_though_every_needle_is_caught():
 
 def test_psm_m_in_the_way_is_found_in_every_variation():
     # It stands in PSM_A's place, 3 mm to its side, and moves as it does.
-    same = OtherArm(np.array([3.0, 0.0, 0.0]), np.array([0.0, 0, 0, 1]), "400006", ALONE.joints)
+    same = handoff.OtherArm(np.array([3.0, 0.0, 0.0]), np.array([0.0, 0, 0, 1]), "400006", ALONE.joints)
     found = under(judged(replace(ALONE, psm_m=same), settings=NO_DOUBT, errors=EXACT))
     assert (found.passes[0].faults.arms, found.passes[0].faults.pad, found.plan.count) == (40, 0, 0)
 
@@ -163,7 +154,7 @@ def test_an_arm_offset_down_nears_the_pad_and_a_pass_shifted_down_does_not():
 
 def test_each_arm_comes_nearer_to_the_other_by_its_own_offset():
     # PSM_M moves as PSM_A does, 20 mm beside it along x: more than 8 mm of shafts and the limit.
-    beside = OtherArm(np.array([20.0, 0.0, 0.0]), np.array([0.0, 0, 0, 1]), "400006", ALONE.joints)
+    beside = handoff.OtherArm(np.array([20.0, 0.0, 0.0]), np.array([0.0, 0, 0, 1]), "400006", ALONE.joints)
     scene = looked_at(scene_of(replace(ALONE, psm_m=beside), 0, PAD_TOP_MM, 0.06), 20)
     along = [[0, 0, 0], [13, 0, 0], [-13, 0, 0], [0, 13, 0]]
     assert wrong(scene, a=along)["arms"] == [False, True, False, False]
@@ -196,7 +187,7 @@ def test_the_pad_is_cleared_as_often_as_the_error_function_says(normal):
 def test_only_fingers_may_touch_and_only_at_the_hand_off():
     scene = scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD)
     assert BESIDE.psm_m is not None and BESIDE.psm_m.jaw_rad is not None
-    closing = int(np.argmax(BESIDE.psm_m.jaw_rad < JAW_OPEN_RAD))  # one tick after both arms have come to stand
+    closing = int(np.argmax(BESIDE.psm_m.jaw_rad < handoff.JAW_OPEN_RAD))  # one tick after both arms have come to stand
     assert np.flatnonzero(scene.handing_over).tolist() == list(range(closing - 1, len(scene.phase)))
     thin = looked_at(scene, 8)
     assert np.array_equal(thin.handing_over, thin.stamps_s >= BESIDE.stamps_s[closing - 1])
@@ -213,19 +204,19 @@ def test_only_fingers_may_touch_and_only_at_the_hand_off():
 def test_psm_ms_fingers_are_as_open_as_its_jaw_is_planned_to_be():
     """They come in open, hold the needle while PSM_A leaves, and let it go again; without a plan they stay open."""
     first, second = (scene_of(BESIDE, k, PAD_TOP_MM, OPENING_RAD).arms[1].opening_rad for k in (0, 1))
-    assert (first[0], first[-1]) == (OPENING_RAD, HOLDING_RAD)
-    assert (second[0], second.max(), second[-1]) == (HOLDING_RAD, OPENING_RAD, HOLDING_RAD)
+    assert (first[0], first[-1]) == (OPENING_RAD, handoff.HOLDING_RAD)
+    assert (second[0], second.max(), second[-1]) == (handoff.HOLDING_RAD, OPENING_RAD, handoff.HOLDING_RAD)
     other = replace(BESIDE.psm_m, jaw_rad=None)
     unplanned = scene_of(replace(BESIDE, psm_m=other), 1, PAD_TOP_MM, OPENING_RAD).arms[1].opening_rad
     assert (unplanned == OPENING_RAD).all()
 
 
-@pytest.mark.parametrize(("jaw_rad", "touch"), [(JAW_OPEN_RAD, True), (JAW_CLOSED_RAD, False)])
+@pytest.mark.parametrize(("jaw_rad", "touch"), [(handoff.JAW_OPEN_RAD, True), (handoff.JAW_CLOSED_RAD, False)])
 def test_arms_side_by_side_touch_unless_psm_ms_jaw_is_closed(jaw_rad, touch):
     """An open finger ends 10.2 sin 30 = 5.1 mm beside its hinge, a closed one 0.6 mm."""
     apart = 9.5 * matrix_of(ALONE.rotation_xyzw[:1])[0, :, 1]  # the side to which fingers open
-    mine, theirs = (np.full(len(ALONE), angle) for angle in (JAW_OPEN_RAD, jaw_rad))
-    same = OtherArm(apart, np.array([0.0, 0, 0, 1]), "400006", ALONE.joints, theirs)
+    mine, theirs = (np.full(len(ALONE), angle) for angle in (handoff.JAW_OPEN_RAD, jaw_rad))
+    same = handoff.OtherArm(apart, np.array([0.0, 0, 0, 1]), "400006", ALONE.joints, theirs)
     scene = scene_of(replace(ALONE, psm_m=same, jaw_rad=mine), 0, PAD_TOP_MM, OPENING_RAD)
     scene = replace(scene, arms=tuple(arm.at(np.array([0])) for arm in scene.arms))
     scene = replace(scene, phase=scene.phase[:1], stamps_s=scene.stamps_s[:1])
@@ -249,11 +240,11 @@ def test_stricter_limits_of_the_playback_are_kept():
 
 
 def test_a_jaw_that_was_not_realigned_hands_nothing_on():
-    askew = realign(POINTING_DOWN, (-0.3, 0.9, -0.3)).rotation
+    askew = handoff.realign(POINTING_DOWN, (-0.3, 0.9, -0.3)).rotation
     path = replace(pass_path(), target_rotation=askew)
     turned = time_parametrise([path], rate_hz=100.0)
     beside = motion(1, PSM_M)
-    other = OtherArm(
+    other = handoff.OtherArm(
         np.array(BASE_MM), np.array(BASE_XYZW), "400006", np.repeat(beside.psm_m.joints[-1:], len(turned), 0)
     )
     found = judged(replace(turned, psm_m=other), settings=NO_DOUBT, errors=EXACT)
@@ -542,7 +533,7 @@ def some_plan(seed: int) -> tuple[Trajectory, ArmErrors, Pad]:
     approach = np.array(PSM_M.approach) + rng.uniform(-0.15, 0.15, 3)
     path = PATH_MM + rng.uniform(-4, 4, 3) + np.append(np.zeros((1, 3)), rng.uniform(-2, 2, (3, 3)), axis=0)
     psm_m = replace(PSM_M, approach=tuple(approach.tolist()))
-    one = PassPath(path, POINTING_DOWN, realign(POINTING_DOWN, approach).rotation)
+    one = PassPath(path, POINTING_DOWN, handoff.realign(POINTING_DOWN, approach).rotation)
     below_mm, slope, towards = rng.uniform(2.0, 6.0), radians(12.0 * (seed % 3)), float(seed)
     normal = (sin(slope) * cos(towards), sin(slope) * sin(towards), cos(slope))
     pad_top_mm = float((path @ normal).min()) - 10.2 - below_mm

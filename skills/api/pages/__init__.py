@@ -1,4 +1,4 @@
-"""Web pages: templates, and content negotiation.
+"""Web pages from templates.
 
 There are two kinds of pages. `render` renders a page of the site from a template; it loads its scripts, style and data
 from this server only. `standalone` renders a document to be stored or sent; a browser runs and fetches nothing for it.
@@ -19,31 +19,8 @@ from pydantic_core import to_jsonable_python
 from skills.api.authorisation import Caller, Role
 from skills.api.pages.assets import build
 from skills.api.pages.filters import FILTERS
-from skills.errors import UnknownFormat
-from skills.fields import plain_json
+from skills.api.responses import HTML
 from skills.formats import READABLE
-
-HTML = "text/html"
-JSON = "application/json"
-
-
-def wants_page(accept: str, what: str) -> bool:
-    """Return whether the client prefers a page to JSON: the first of them that its `Accept` header names.
-
-    Args:
-        accept: The header.
-        what: The resource, as the subject of the error's sentence.
-
-    Raises:
-        UnknownFormat: The client accepts neither.
-    """
-    for wanted in (part.partition(";")[0].strip().lower() for part in accept.split(",")):
-        if wanted in (HTML, "text/*"):
-            return True
-        if wanted in (JSON, "application/*", "*/*"):
-            return False
-    raise UnknownFormat(f"{what} is available as {JSON} or {HTML}; name one of them in Accept.")
-
 
 # Scripts and styles only from our files, none inline. Swagger UI has images at `data:` URLs.
 SITE_POLICY = (
@@ -67,7 +44,6 @@ def templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": plain_json}
     made.filters |= FILTERS
     made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": to_jsonable_python}  # values and models too
     return made
@@ -92,7 +68,7 @@ def render(request: Request, template: str, caller: Caller | None, *, status: in
         "may": lambda role: reached >= ladder.index(role),
     }
     html = templates().get_template(template).render(**about, **context)
-    return Response(html, status, headers=SITE_HEADERS, media_type="text/html")
+    return Response(html, status, headers=SITE_HEADERS, media_type=HTML)
 
 
 @cache

@@ -6,60 +6,39 @@ from collections.abc import Callable
 from fastapi import Response
 from sqlalchemy.orm import Session
 
-from skills.api.authorisation import needs
-from skills.api.dependencies import (
-    Accept,
-    Db,
-    Digest,
-    Slug,
-    Version,
-)
+from skills.api.dependencies import Accept, Db, Digest, Slug, Version
 from skills.api.openapi import gives, router_of
-from skills.api.pages import HTML, standalone_headers, wants_page
+from skills.api.pages import standalone_headers
 from skills.api.pages.drawings import card_page
-from skills.api.responses import (
-    JSON,
-    Condition,
-    Giving,
-    json_of,
-    names,
-    tag_of,
-)
+from skills.api.responses import HTML, JSON, Give, Giving, json_of, negotiate
 from skills.db.models import PolicyVersion
 from skills.db.session import Database
 from skills.library.operation.proofs import head_over, sign_files
 from skills.library.policies import versions
 from skills.library.policies.cards import Card, card_of
 from skills.schemas.cards import PolicyCard
-from skills.settings import MEBIBYTE
 from skills.transparency.notes import read_notes
 from skills.transparency.statements import SignedEnvelope
 
-router = router_of(tags=["policies"], max_body_size=MEBIBYTE)
+router = router_of("policies")
 
 
 @router.get(
     "/policies/{surgeon}/{suture}/versions/{version}/card",
-    dependencies=[needs("reader")],
-    **gives(PolicyCard, 404, 409, 410, 415, as_well=(HTML,)),
+    **gives("reader", PolicyCard, 404, 409, 410, 415, as_well=(HTML,)),
 )
-def get_policy_card(
-    surgeon: Slug, suture: Slug, version: Version, db: Db, accept: Accept = "*/*", if_none_match: Condition = None
-) -> Response:
+def get_policy_card(surgeon: Slug, suture: Slug, version: Version, db: Db, give: Giving, accept: Accept) -> Response:
     """Return the policy card of a version: JSON, or with `Accept: text/html` one file to attach to a paper.
 
     It states whether the version is released now and what rests on it, so its ETag changes with these.
     """
-    as_page = wants_page(accept, "A policy card")
+    as_page = _as_page(accept)
     find = versions.choose if as_page else versions.find_version
-    card = _card(db, lambda session: find(session, surgeon, suture, version))
-    return _answer(card, as_page, if_none_match)
+    return _answer(give, _card(db, lambda session: find(session, surgeon, suture, version)), as_page)
 
 
 @router.get(
-    "/policies/{surgeon}/{suture}/versions/{version}/card/signature",
-    dependencies=[needs("reader")],
-    **gives(SignedEnvelope, 404, 410),
+    "/policies/{surgeon}/{suture}/versions/{version}/card/signature", **gives("reader", SignedEnvelope, 404, 410)
 )
 def get_policy_card_signature(surgeon: Slug, suture: Slug, version: Version, db: Db, give: Giving) -> Response:
     """Return this service's signature of the policy card of a version as it is now: of its JSON and of its page."""
@@ -73,19 +52,16 @@ def get_policy_card_signature(surgeon: Slug, suture: Slug, version: Version, db:
     return give.bytes(sign_files(db.history, head, digests, kind="card", **facts), JSON)
 
 
-@router.get(
-    "/policy-versions/{policy}/card",
-    dependencies=[needs("reader")],
-    **gives(PolicyCard, 404, 409, 415, as_well=(HTML,)),
-)
-def get_policy_version_card(
-    policy: Digest, db: Db, accept: Accept = "*/*", if_none_match: Condition = None
-) -> Response:
+@router.get("/policy-versions/{policy}/card", **gives("reader", PolicyCard, 404, 409, 415, as_well=(HTML,)))
+def get_policy_version_card(policy: Digest, db: Db, give: Giving, accept: Accept) -> Response:
     """Return the policy card of a version by the digest under which it is cited."""
-    as_page = wants_page(accept, "A policy card")
+    as_page = _as_page(accept)
     seen = versions.followable if as_page else lambda version: version
-    card = _card(db, lambda session: seen(versions.find_by_digest(session, policy)))
-    return _answer(card, as_page, if_none_match)
+    return _answer(give, _card(db, lambda session: seen(versions.find_by_digest(session, policy))), as_page)
+
+
+def _as_page(accept: str) -> bool:
+    return negotiate(accept, "A policy card", JSON, HTML) == HTML
 
 
 def _card(db: Database, find: Callable[[Session], PolicyVersion]) -> Card:
@@ -99,17 +75,11 @@ def _content(card: Card, *, as_page: bool) -> bytes:
     return card_page(card).encode() if as_page else json_of(card.facts, indented=True)
 
 
-def _answer(card: Card, as_page: bool, if_none_match: str | None) -> Response:
-    content = _content(card, as_page=as_page)
-    tag, told = tag_of(content), card.facts.policy
-    name = f"{told.surgeon}-{told.suture}-v{told.version}-card.{'html' if as_page else 'json'}"
-    headers = {
-        "ETag": tag,
-        "Vary": "Accept",
-        "Cache-Control": "no-cache",
-        "Content-Disposition": f'inline; filename="{name}"',  # the name under which a browser saves it
-        **(standalone_headers("card") if as_page else {}),
-    }
-    if if_none_match is not None and names(if_none_match, tag):
-        return Response(status_code=304, headers=headers)
-    return Response(content, headers=headers, media_type=HTML if as_page else JSON)
+def _answer(give: Give, card: Card, as_page: bool) -> Response:
+    told, kind = card.facts.policy, "html" if as_page else "json"
+    answer = give.bytes(_content(card, as_page=as_page), HTML if as_page else JSON)
+    name = f"{told.surgeon}-{told.suture}-v{told.version}-card.{kind}"
+    answer.headers["Content-Disposition"] = f'inline; filename="{name}"'  # the name under which a browser saves it
+    if as_page:
+        answer.headers.update(standalone_headers("card"))
+    return answer

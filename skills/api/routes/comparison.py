@@ -6,15 +6,15 @@ a style; nothing of it is stored.
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Response
 
-from skills.api.authorisation import Asking, needs
+from skills.api.authorisation import needs
 from skills.api.dependencies import Db, Digest, Parse, Slug
 from skills.api.openapi import gives, router_of, says
-from skills.api.pages import drawings, render
+from skills.api.pages import drawings
 from skills.api.responses import Giving, say
-from skills.api.routes.pages import PageRoute, Picked
-from skills.api.strict_json import Strict
+from skills.api.routes.pages import Picked, WebPage
+from skills.api.routes.pages import router as page_router
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.comparison import scores
 from skills.library.comparison.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
@@ -26,15 +26,11 @@ from skills.library.people.suture_types import find_suture_type
 from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
 from skills.schemas.requests import COUNT, DIGEST, SLUG
 from skills.schemas.scores import Progress, Score, ScoreIn
-from skills.settings import MEBIBYTE
 
-atlas_router = router_of(tags=["atlas"], max_body_size=MEBIBYTE)
-
-
-score_router = router_of(route_class=Strict, tags=["scores"], max_body_size=MEBIBYTE)
+atlas_router = router_of("atlas")
 
 
-page_router = APIRouter(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
+score_router = router_of("scores")
 
 
 Clusters = Annotated[
@@ -47,7 +43,7 @@ AskedDemo = Annotated[
 ]
 
 
-@atlas_router.get("/styles/{suture}/atlas", dependencies=[needs("reader")], **gives(Atlas, 404, 409))
+@atlas_router.get("/styles/{suture}/atlas", **gives("reader", Atlas, 404, 409))
 def get_atlas(
     suture: Slug,
     db: Db,
@@ -67,7 +63,7 @@ def get_atlas(
 MOST_NEAREST = 100  # neighbours of a demonstration
 
 
-@atlas_router.get("/demos/{demo}/nearest", dependencies=[needs("reader")], **gives(Nearest, 404, 409))
+@atlas_router.get("/demos/{demo}/nearest", **gives("reader", Nearest, 404, 409))
 def get_nearest(
     demo: Digest,
     db: Db,
@@ -82,9 +78,7 @@ def get_nearest(
     return give(nearest_to(db, demo, count, scaled=scaled))
 
 
-@atlas_router.get(
-    "/styles/{suture}/recognition", dependencies=[needs("reader")], **gives(RecognisedRecording, 404, 409)
-)
+@atlas_router.get("/styles/{suture}/recognition", **gives("reader", RecognisedRecording, 404, 409))
 def recognise(
     suture: Slug,
     db: Db,
@@ -99,7 +93,7 @@ def recognise(
     return give(recognise_recording(db, recording, suture, parse))
 
 
-@score_router.post("/scores", dependencies=[needs("reader")], **says(Score, 404, 409, 410))
+@score_router.post("/scores", **says("reader", Score, 404, 409, 410))
 def score(body: ScoreIn, db: Db, parse: Parse) -> Response:
     """Score a motion: its figures compared with the reference's, its deviation, percentiles, and a curve over time.
 
@@ -108,7 +102,7 @@ def score(body: ScoreIn, db: Db, parse: Parse) -> Response:
     return say(scores.score(db, body, parse))
 
 
-@score_router.get("/surgeons/{surgeon}/progress", dependencies=[needs("reader")], **gives(Progress, 404, 409, 410))
+@score_router.get("/surgeons/{surgeon}/progress", **gives("reader", Progress, 404, 409, 410))
 def surgeon_progress(
     surgeon: Slug,
     db: Db,
@@ -127,18 +121,16 @@ MOST_PAIRS = 60  # of surgeons, shown on a page
 
 
 @page_router.get("/pages/atlas", dependencies=[needs("reader")])
-def show_atlases(request: Request, caller: Asking, db: Db) -> Response:
+def show_atlases(page: WebPage) -> Response:
     """Show the suture types that have demonstrations to compare."""
-    with db.reading() as session:
-        return render(request, "atlases.html", caller, found=atlases(session))
+    with page.db.reading() as session:
+        return page.show("atlases.html", found=atlases(session))
 
 
 @page_router.get("/pages/atlas/{suture}", dependencies=[needs("reader")])
 def show_atlas(
     suture: Slug,
-    request: Request,
-    caller: Asking,
-    db: Db,
+    page: WebPage,
     scaled: bool = False,
     clusters: Annotated[str, Query(pattern=COUNT)] = "",
     demo: Annotated[str | None, Query(pattern=DIGEST)] = None,
@@ -146,7 +138,7 @@ def show_atlas(
     """Show an atlas: chart, distances with their dendrogram, surgeons, and the recognition of a demonstration."""
     number = int(clusters or 0) or None  # a form sends an empty text for a field without a value
     try:
-        found = atlas_of(db, suture, scaled=scaled, clusters=number, demo=demo)
+        found = atlas_of(page.db, suture, scaled=scaled, clusters=number, demo=demo)
     except (Conflict, BadInput) as refused:
         raise NotFound(refused.words()) from refused  # rendered as a page that states the reason
     pairs = sorted(found.differences, key=lambda one: -one.distance)[:MOST_PAIRS]
@@ -158,11 +150,9 @@ def show_atlas(
         "thirds": [drawings.thirds(one.shares) for one in pairs],
         "most": drawings.MOST_GROUPS,
     }
-    with db.reading() as session:
-        return render(
-            request,
+    with page.db.reading() as session:
+        return page.show(
             "atlas.html",
-            caller,
             suture=find_suture_type(session, suture),
             atlas=found,
             drawn=drawn,
@@ -175,11 +165,9 @@ def show_atlas(
 
 
 @page_router.get("/pages/surgeons/{surgeon}", dependencies=[needs("reader")])
-def show_surgeon(
-    surgeon: Slug, request: Request, caller: Asking, db: Db, suture: Picked = None, against: Picked = None
-) -> Response:
+def show_surgeon(surgeon: Slug, page: WebPage, suture: Picked = None, against: Picked = None) -> Response:
     """Show a surgeon over time: the demonstrations of a suture type, session by session, beside a style's reference."""
-    with db.reading() as session:
+    with page.db.reading() as session:
         found = find_surgeon(session, surgeon)
         listed = [style for style in styles.styles_of(session, found) if style.demos]
         chosen = suture or next((style.suture for style in listed), None)
@@ -188,13 +176,11 @@ def show_surgeon(
     shown, refused = None, ""
     if chosen:
         try:
-            shown = scores.progress(db, surgeon, chosen, compared)
+            shown = scores.progress(page.db, surgeon, chosen, compared)
         except (Conflict, BadInput, NotFound) as error:
             refused = error.words()  # beside what else is known of the surgeon
-    return render(
-        request,
+    return page.show(
         "surgeon.html",
-        caller,
         surgeon=found,
         styles=listed,
         asked={"suture": chosen, "against": compared},

@@ -7,7 +7,7 @@ from fastapi.responses import PlainTextResponse
 from pydantic import AwareDatetime
 
 from skills.api.authorisation import needs, open_to_all
-from skills.api.dependencies import Db
+from skills.api.dependencies import Configured, Db
 from skills.api.metrics import CONTENT_TYPE, ServiceMetrics
 from skills.api.openapi import router_of, says
 from skills.api.pages import render
@@ -17,31 +17,30 @@ from skills.library.operation.proofs import served_at as find_served
 from skills.library.operation.proofs import signed_checkpoint
 from skills.sandbox.containment import LAYERS
 from skills.sandbox.forked import layers_held
-from skills.schemas.given import Alive, Ready, ServedAt, SignedCheckpoint
 from skills.schemas.requests import SLUG
-from skills.settings import MEBIBYTE, Settings
+from skills.schemas.responses import Alive, Ready, ServedAt, SignedCheckpoint
+from skills.settings import MEBIBYTE
 
-router = router_of(tags=["operating"])
+router = router_of("operating")
 
 
-@router.get("/healthz", dependencies=[open_to_all()], **says(Alive))
+@router.get("/healthz", **says(None, Alive))
 def alive() -> Response:
     """Report that the process answers requests."""
     return say({"status": "ok", "use": "research use only"})
 
 
-@router.get("/readyz", dependencies=[needs("reader", whole=True)], **says(Ready))
-def ready(request: Request) -> Response:
+@router.get("/readyz", **says("reader", Ready, whole=True))
+def ready(settings: Configured) -> Response:
     """Check the database, the job queue and its workers; 503 with the name of the one that cannot be used.
 
     `containment` has the layers that contain readers, simulators and learners, and whether this system offers each.
     """
-    settings: Settings = request.app.state.settings
     workers, held = refuse_unready(settings), layers_held()
     return say({"status": "ready", "workers": workers, "containment": {name: name in held for name in LAYERS}})
 
 
-@router.get("/history", dependencies=[needs("reader")], **says(ServedAt, 404, 410))
+@router.get("/history", **says("reader", ServedAt, 404, 410))
 def served_at(
     db: Db,
     surgeon: Annotated[str, Query(pattern=SLUG)],
@@ -53,7 +52,7 @@ def served_at(
         return say(find_served(session, db.history, surgeon, suture, at))
 
 
-@router.get("/history/checkpoint", dependencies=[needs("reader")], **says(SignedCheckpoint))
+@router.get("/history/checkpoint", **says("reader", SignedCheckpoint))
 def newest_head(db: Db) -> Response:
     """Return the newest signed checkpoint of the history, to be kept elsewhere."""
     with db.reading() as session:

@@ -12,18 +12,7 @@ from sqlalchemy.orm import Session
 
 from skills import errors
 from skills.api.authorisation import Asking, Caller, needs, open_to_all
-from skills.api.dependencies import (
-    Configured,
-    Db,
-    Digest,
-    JobId,
-    Limit,
-    Parse,
-    RowCursor,
-    Slug,
-    SlugCursor,
-    Version,
-)
+from skills.api.dependencies import Configured, Db, Digest, JobId, Limit, Parse, RowCursor, Slug, SlugCursor, Version
 from skills.api.pages import drawings, render
 from skills.api.pages.assets import assets, build
 from skills.api.responses import JSON
@@ -103,7 +92,10 @@ async def _asked(request: Request, caller: Asking, db: Db) -> Asked:
     return Asked(request, caller, db)
 
 
-Page = Annotated[Asked, Depends(_asked)]
+WebPage = Annotated[Asked, Depends(_asked)]
+
+
+# The router of all pages; the modules of nouns add theirs.
 router = APIRouter(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
 
 
@@ -122,7 +114,7 @@ def get_static(version: str, name: str, request: Request) -> Response:
 
 @router.get("/", dependencies=[needs("reader")])
 def show_catalogue(
-    page: Page,
+    page: WebPage,
     q: Words = "",
     state: Literal["", "released", "trained", "stored", "empty"] = "",
     skill: Literal["", "novice", "intermediate", "expert"] = "",
@@ -140,7 +132,7 @@ def show_catalogue(
 def show_style(
     surgeon: Slug,
     suture: Slug,
-    page: Page,
+    page: WebPage,
     version: Annotated[int | None, Query(ge=1)] = None,
     beside: Annotated[int | None, Query(ge=1)] = None,
 ) -> Response:
@@ -179,7 +171,7 @@ def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
 @router.get("/pages/demos/{demo}/score", dependencies=[needs("reader")])
 def show_score(
     demo: Digest,
-    page: Page,
+    page: WebPage,
     tell: Parse,
     surgeon: Annotated[str, Query(max_length=64)] = "",
     task: Annotated[str, Query(max_length=64, pattern="^[A-Za-z_]*$")] = "",
@@ -205,7 +197,7 @@ def show_score(
 
 
 @router.get("/pages/recordings", dependencies=[needs("reader")])
-def show_recordings(page: Page, cursor: RowCursor = None) -> Response:
+def show_recordings(page: WebPage, cursor: RowCursor = None) -> Response:
     """Show the newest recordings."""
     with page.db.reading() as session:
         found = overview.newest_recordings(session, cursor)
@@ -213,7 +205,7 @@ def show_recordings(page: Page, cursor: RowCursor = None) -> Response:
 
 
 @router.get("/pages/recordings/new", dependencies=[needs("reader")])
-def show_upload(page: Page, surgeon: Picked = None, suture: Picked = None) -> Response:
+def show_upload(page: WebPage, surgeon: Picked = None, suture: Picked = None) -> Response:
     """Show the form that uploads a recording."""
     with page.db.reading() as session:
         return page.show(
@@ -228,7 +220,7 @@ def show_upload(page: Page, surgeon: Picked = None, suture: Picked = None) -> Re
 
 
 @router.get("/pages/recordings/{recording}", dependencies=[needs("reader")])
-def show_recording(recording: Digest, page: Page, surgeon: Picked = None, suture: Picked = None) -> Response:
+def show_recording(recording: Digest, page: WebPage, surgeon: Picked = None, suture: Picked = None) -> Response:
     """Show a recording: its quality, its proposed hand-offs, and the demonstrations cut out of it."""
     with page.db.reading() as session:
         found = find_recording(session, recording)
@@ -252,7 +244,7 @@ def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Parse) -> R
 
 
 @router.get("/pages/plans", dependencies=[needs("reader")])
-def show_plans(page: Page, settings: Configured, cursor: RowCursor = None) -> Response:
+def show_plans(page: WebPage, settings: Configured, cursor: RowCursor = None) -> Response:
     """Show the newest plans with their verdicts."""
     with page.db.reading() as session:
         found = [
@@ -264,7 +256,7 @@ def show_plans(page: Page, settings: Configured, cursor: RowCursor = None) -> Re
 
 @router.get("/pages/plans/new", dependencies=[needs("reader")])
 def show_plan_editor(
-    page: Page,
+    page: WebPage,
     surgeon: Picked = None,
     suture: Picked = None,
     version: Annotated[int | None, Query(ge=1)] = None,
@@ -303,7 +295,7 @@ def _assumed_psm_m(goal_mm: Point) -> dict[str, str]:
 
 
 @router.get("/pages/plans/{plan}", dependencies=[needs("reader")])
-def show_plan(plan: Digest, page: Page, settings: Configured) -> Response:
+def show_plan(plan: Digest, page: WebPage, settings: Configured) -> Response:
     """Show a plan with its playbacks."""
     with page.db.reading() as session:
         found = followed_plan(session, plan)
@@ -321,7 +313,7 @@ def show_plan(plan: Digest, page: Page, settings: Configured) -> Response:
 
 @router.get("/pages/jobs", dependencies=[needs("reader")])
 def show_jobs(
-    page: Page,
+    page: WebPage,
     state: Literal["", "queued", "running", "succeeded", "failed", "cancelled"] = "",
     cursor: RowCursor = None,
 ) -> Response:
@@ -338,7 +330,7 @@ def show_jobs(
 
 
 @router.get("/pages/jobs/{job}", dependencies=[needs("reader")])
-def show_job(job: JobId, page: Page, limit: Limit = overview.MOST, cursor: RowCursor = None) -> Response:
+def show_job(job: JobId, page: WebPage, limit: Limit = overview.MOST, cursor: RowCursor = None) -> Response:
     """Show a job as it runs, and the styles of a batch."""
     with page.db.reading() as session:
         found = jobs.find_job(session, job)
@@ -354,7 +346,7 @@ def show_job(job: JobId, page: Page, limit: Limit = overview.MOST, cursor: RowCu
 
 
 @router.get("/pages/catalogue", dependencies=[needs("reader")])
-def show_people(page: Page, q: Words = "", cursor: SlugCursor = None) -> Response:
+def show_people(page: WebPage, q: Words = "", cursor: SlugCursor = None) -> Response:
     """Show surgeons and suture types, with forms that add and change them."""
     with page.db.reading() as session:
         return page.show(

@@ -14,24 +14,12 @@ import orjson
 from fastapi import Query, Response
 from pydantic import Field
 
-from skills.api.authorisation import needs
-from skills.api.dependencies import (
-    Accept,
-    Actor,
-    Configured,
-    Db,
-    Digest,
-    Limit,
-    Read,
-    RowCursor,
-)
-from skills.api.openapi import gives, gives_page, makes, router_of, says
-from skills.api.responses import JSON, Giving, say, stored
+from skills.api.dependencies import Accept, Actor, Configured, Db, Digest, ListingByRow, Read
+from skills.api.openapi import gives, makes, router_of, says, uploads_of
+from skills.api.responses import JSON, Giving, negotiate, say, stored
 from skills.api.routes.recordings import RAW_BODY
-from skills.api.strict_json import Strict
 from skills.api.uploads import Incoming
 from skills.db.session import Database
-from skills.errors import UnknownFormat
 from skills.formats.replay_bag import rows_of_pass
 from skills.library.operation import overview
 from skills.library.plans import plans
@@ -50,35 +38,34 @@ from skills.schemas.playbacks import Comparison
 from skills.schemas.reach import Reach, ReachIn
 from skills.schemas.recordings import SuturePoints
 from skills.schemas.requests import DIGEST, FRAME, Name, Schema
-from skills.settings import MEBIBYTE, Settings
+from skills.settings import Settings
 
-router = router_of(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
+router = router_of("plans")
 
 
-@router.post("/plans", dependencies=[needs("trainer")], **makes(Plan, 404, 409, 410))
+@router.post("/plans", **makes("trainer", Plan, 404, 409, 410))
 def make_plan(body: PlanIn, db: Db, actor: Actor) -> Response:
     """Stack a style's grid world at suture points."""
     row, created = plans.plan_sutures(db, body, actor)
     return stored(describe_stored(row), created, f"/plans/{row.sha256}")
 
 
-@router.get("/plans", dependencies=[needs("reader")], **gives_page(Page[PlanSummary], 410))
-def list_plans(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None) -> Response:
+@router.get("/plans", **gives("reader", Page[PlanSummary], 410))
+def list_plans(db: Db, listing: ListingByRow) -> Response:
     """List plans, the newest first, each with its newest playback."""
     with db.reading() as session:
-        found = overview.newest_plans(session, cursor, limit)
-        written = [summarise(plan, played) for plan, played in found]
-        return give.page(written, limit, found[-1][0].row if found else None)
+        found = overview.newest_plans(session, listing.cursor, listing.limit)
+        return listing.page([summarise(plan, played) for plan, played in found], [plan for plan, _ in found])
 
 
-@router.get("/plans/{plan}", dependencies=[needs("reader")], **gives(Plan, 404, 409))
+@router.get("/plans/{plan}", **gives("reader", Plan, 404, 409))
 def get_plan(plan: Digest, db: Db, give: Giving) -> Response:
     """Return a plan with its paths, while the surgeon's consent covers training."""
     with db.reading() as session:
         return give(describe_stored(plans.followed_plan(session, plan)))
 
 
-@router.post("/reach", dependencies=[needs("trainer")], **says(Reach, 404, 409, 410))
+@router.post("/reach", **says("trainer", Reach, 404, 409, 410))
 def map_reach(body: ReachIn, db: Db) -> Response:
     """Return where a style can be planned: reach, joint margins and clearances over positions and rotations.
 
@@ -89,7 +76,7 @@ def map_reach(body: ReachIn, db: Db) -> Response:
     return say(map_style(db, body))
 
 
-suture_point_router = router_of(tags=["plans"])
+suture_point_router = uploads_of("plans")
 
 
 class SuturePointsUpload(Schema):
@@ -101,9 +88,7 @@ class SuturePointsUpload(Schema):
     )
 
 
-@suture_point_router.post(
-    "/suture-points", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **says(SuturePoints)
-)
+@suture_point_router.post("/suture-points", openapi_extra=RAW_BODY, **says("uploader", SuturePoints))
 def read_suture_points(upload: Incoming, asked: Annotated[SuturePointsUpload, Query()], read: Read) -> Response:
     """Read the Entry and Exit marks of a simulator's MCAP file, in an arm's base frame; nothing is stored.
 
@@ -112,8 +97,6 @@ def read_suture_points(upload: Incoming, asked: Annotated[SuturePointsUpload, Qu
     """
     return say(find_suture_points(upload, asked.arm, asked.frame, read))
 
-
-trajectory_router = router_of(tags=["plans"])
 
 BAG, TABLE = "application/zip", "text/csv"
 COLUMNS = (
@@ -125,21 +108,17 @@ PassIndex = Annotated[int | None, _PASS]
 OnePass = Annotated[int, _PASS]
 
 
-@trajectory_router.get(
-    "/plans/{plan}/trajectory",
-    dependencies=[needs("reader")],
-    **gives(GivenTrajectory, 404, 409, 415, as_well=(TABLE, BAG)),
-)
+@router.get("/plans/{plan}/trajectory", **gives("reader", GivenTrajectory, 404, 409, 415, as_well=(TABLE, BAG)))
 def get_trajectory(
     plan: Digest,
     db: Db,
     settings: Configured,
     give: Giving,
+    accept: Accept,
     pass_index: PassIndex = None,
     handoff: Annotated[
         Literal["none"] | None, Query(description="`none` is required for the bag of a plan without a hand-off.")
     ] = None,
-    accept: Accept = "*/*",
 ) -> Response:
     """Return the sampled motion of a plan: JSON, `Accept: text/csv` a table, `Accept: application/zip` the replay bag.
 
@@ -147,7 +126,7 @@ def get_trajectory(
     exists for exactly this plan, its policy is the released one, its demonstration is not withdrawn, the consent covers
     an export, and every pass is certain enough to succeed; for a plan without a hand-off it also needs `handoff=none`.
     """
-    media_type = _media_type(accept)
+    media_type = negotiate(accept, "A trajectory", JSON, TABLE, BAG)
     content = _contents(db, plan, pass_index, handoff, media_type, settings)
     given = give.bytes(content, media_type)
     if media_type == BAG:
@@ -156,29 +135,13 @@ def get_trajectory(
     return given
 
 
-@trajectory_router.get("/plans/{plan}/comparison", dependencies=[needs("reader")], **gives(Comparison, 404, 409))
+@router.get("/plans/{plan}/comparison", **gives("reader", Comparison, 404, 409))
 def compare(
     plan: Digest, demo: Annotated[str, Query(pattern=DIGEST)], db: Db, give: Giving, pass_index: OnePass = 0
 ) -> Response:
     """Compare a pass of a plan with a demonstration cut from the recording of its replay."""
     with db.reading() as session:
         return give(compare_with_plan(session, plan, demo, pass_index))
-
-
-def _media_type(accept: str) -> str:
-    """Return the media type that the client names first.
-
-    Raises:
-        UnknownFormat: It accepts none of the three.
-    """
-    for one in (part.partition(";")[0].strip().lower() for part in accept.split(",")):
-        if one in (JSON, TABLE, BAG):
-            return one
-        if one in ("*/*", "application/*"):
-            return JSON
-    raise UnknownFormat(
-        f"A trajectory is available as {JSON}, {TABLE}, or {BAG} for replay; name one of them in Accept."
-    )
 
 
 def _contents(

@@ -2,16 +2,15 @@
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Response
 from pydantic import Field
 
 from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import Actor, Db, Digest, Limit, Parse, RowCursor
-from skills.api.openapi import ends, gives, gives_page, makes, router_of, says
-from skills.api.pages import render
+from skills.api.dependencies import Actor, Db, Digest, ListingByRow, OfRecording, OfSurgeon, Parse, RowCursor
+from skills.api.openapi import ends, gives, makes, router_of, says, uploads_of
 from skills.api.responses import Giving, say, stored
-from skills.api.routes.pages import PageRoute, Picked
-from skills.api.strict_json import Strict
+from skills.api.routes.pages import Picked, WebPage
+from skills.api.routes.pages import router as page_router
 from skills.api.uploads import Incoming
 from skills.formats import BYTES, MEDIA_TYPES
 from skills.library.operation import locks, overview
@@ -23,16 +22,12 @@ from skills.library.recordings.recordings import describe_recording, find_record
 from skills.schemas import Page, ProposalState
 from skills.schemas.demos import Proposal, ProposalIn
 from skills.schemas.recordings import Recording, RecordingPreview, RecordingSummary, TableIn
-from skills.schemas.requests import DIGEST, SLUG, SlugField
-from skills.settings import MEBIBYTE
+from skills.schemas.requests import SLUG, SlugField
 
-uploads = router_of(tags=["demonstrations"])
-
-
-router = router_of(route_class=Strict, tags=["demonstrations"], max_body_size=MEBIBYTE)
+uploads = uploads_of("demonstrations")
 
 
-page_router = APIRouter(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
+router = router_of("demonstrations")
 
 
 RAW_BODY = {
@@ -51,9 +46,7 @@ class RecordingQuery(TableIn):
     )
 
 
-@uploads.post(
-    "/recordings", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **makes(Recording, 404, 409, 410)
-)
+@uploads.post("/recordings", openapi_extra=RAW_BODY, **makes("uploader", Recording, 404, 409, 410))
 def add_recording(
     upload: Incoming, asked: Annotated[RecordingQuery, Query()], db: Db, parse: Parse, actor: Actor
 ) -> Response:
@@ -62,29 +55,29 @@ def add_recording(
     return stored(describe_recording(row), created, f"/recordings/{row.sha256}")
 
 
-@uploads.post("/recordings/preview", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **says(RecordingPreview))
+@uploads.post("/recordings/preview", openapi_extra=RAW_BODY, **says("uploader", RecordingPreview))
 def preview_recording(upload: Incoming, asked: Annotated[TableIn, Query()], parse: Parse) -> Response:
     """Read a recording and return what would be understood of it, a table's columns included; nothing is stored."""
     return say(recordings.preview(upload.read_as(asked), parse))
 
 
-@router.get("/recordings", dependencies=[needs("reader")], **gives_page(Page[RecordingSummary], 410))
-def list_recordings(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None) -> Response:
+@router.get("/recordings", **gives("reader", Page[RecordingSummary], 410))
+def list_recordings(db: Db, listing: ListingByRow) -> Response:
     """List recordings, the newest first."""
     with db.reading() as session:
-        found = overview.newest_recordings(session, cursor, limit)
+        found = overview.newest_recordings(session, listing.cursor, listing.limit)
         written = [recordings.summarise_recording(row, cut) for row, cut in found]
-        return give.page(written, limit, found[-1][0].row if found else None)
+        return listing.page(written, [row for row, _ in found])
 
 
-@router.get("/recordings/{recording}", dependencies=[needs("reader")], **gives(Recording, 404))
+@router.get("/recordings/{recording}", **gives("reader", Recording, 404))
 def get_recording(recording: Digest, db: Db, give: Giving) -> Response:
     """Return a recording."""
     with db.reading() as session:
         return give(describe_recording(recordings.find_recording(session, recording)))
 
 
-@router.delete("/recordings/{recording}", dependencies=[needs("uploader")], **ends(404, 409))
+@router.delete("/recordings/{recording}", **ends("uploader", 404, 409))
 def delete_recording(recording: Digest, db: Db, caller: Asking) -> None:
     """Delete a recording without demonstrations permanently; allowed to its uploader and to admins."""
     as_admin = caller.role == "admin"
@@ -101,18 +94,16 @@ def delete_recording(recording: Digest, db: Db, caller: Asking) -> None:
 Number = Annotated[int, Path(ge=1, le=1_000_000, description="The number of the proposal, counted from 1.")]
 
 
-@router.get("/proposals", dependencies=[needs("reader")], **gives_page(Page[Proposal], 404, 410))
+@router.get("/proposals", **gives("reader", Page[Proposal], 404, 410))
 def list_proposals(
     db: Db,
-    give: Giving,
+    listing: ListingByRow,
     state: Annotated[ProposalState | None, Query(description="Only those in this state.")] = None,
-    recording: Annotated[str | None, Query(pattern=DIGEST)] = None,
-    surgeon: Annotated[str | None, Query(pattern=SLUG)] = None,
+    recording: OfRecording = None,
+    surgeon: OfSurgeon = None,
     suture: Annotated[
         str | None, Query(pattern=SLUG, description="Only accepted ones, whose demonstration is of this suture type.")
     ] = None,
-    limit: Limit = 50,
-    cursor: RowCursor = None,
 ) -> Response:
     """List the hand-offs proposed in recordings, those of the newest recording first.
 
@@ -120,11 +111,11 @@ def list_proposals(
     """
     asked = {"recording": recording, "surgeon": surgeon, "suture": suture}
     with db.reading() as session:
-        found, following = proposals.list_proposals(session, limit, cursor, state=state, **asked)
-        return give.page([describe_proposal(one) for one in found], len(found), following)
+        found, following = proposals.list_proposals(session, listing.limit, listing.cursor, state=state, **asked)
+        return listing.give.page([describe_proposal(one) for one in found], following)
 
 
-@router.put("/recordings/{recording}/proposals/{number}", dependencies=[needs("uploader")], **says(Proposal, 404, 409))
+@router.put("/recordings/{recording}/proposals/{number}", **says("uploader", Proposal, 404, 409))
 def decide_proposal(recording: Digest, number: Number, body: ProposalIn, db: Db, actor: Actor) -> Response:
     """Reject a proposed hand-off, or open a rejected one again; `POST /recordings/{recording}/demos` accepts it."""
     with db.reading() as session:
@@ -135,9 +126,7 @@ def decide_proposal(recording: Digest, number: Number, body: ProposalIn, db: Db,
 
 @page_router.get("/pages/proposals", dependencies=[needs("reader")])
 def show_proposals(
-    request: Request,
-    caller: Asking,
-    db: Db,
+    page: WebPage,
     state: Literal["", "open", "accepted", "rejected"] = "open",
     recording: Picked = None,
     surgeon: Picked = None,
@@ -146,12 +135,10 @@ def show_proposals(
 ) -> Response:
     """Show proposed hand-offs, to be accepted, corrected or rejected; a form sends an empty text for any of them."""
     asked = {"recording": recording or None, "surgeon": surgeon or None, "suture": suture or None}
-    with db.reading() as session:
+    with page.db.reading() as session:
         found, following = proposals.list_proposals(session, overview.MOST, cursor, state=state or None, **asked)
-        return render(
-            request,
+        return page.show(
             "proposals.html",
-            caller,
             found=found,
             following=following,
             asked=asked | {"state": state},
@@ -161,6 +148,6 @@ def show_proposals(
 
 
 @page_router.get("/pages/recordings/{recording}/proposals", dependencies=[needs("reader")])
-def draw_proposals(recording: Digest, caller: Asking, db: Db, parse: Parse) -> Response:
+def draw_proposals(recording: Digest, db: Db, parse: Parse) -> Response:
     """Return the paths of the tip in all proposals of a recording, for their small pictures."""
     return say({"paths_mm": proposals.paths_of(db, recording, parse)}, headers={"Cache-Control": "no-store"})

@@ -6,9 +6,8 @@ from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Query, Request, Response
 
-from skills.api.authentication import Access
 from skills.api.authorisation import Asking, needs, open_to_all
-from skills.api.dependencies import Configured
+from skills.api.dependencies import Callers, Configured
 from skills.api.gate import COOKIE, refuse_without_token
 from skills.api.pages import render
 from skills.errors import BadInput, NotSignedIn
@@ -28,10 +27,9 @@ def show_sign_in(request: Request, next: Next = "/") -> Response:
 
 
 @sign_in_router.post("/sign-in", dependencies=[open_to_all()])
-async def begin(request: Request, settings: Configured) -> Response:
+async def begin(request: Request, settings: Configured, access: Callers) -> Response:
     """Exchange a key for a session cookie."""
     form = await _form(request)
-    access: Access = request.app.state.access
     where = _here(form.get("next", "/"))
     try:
         caller = await access.by_key(form.get("key", "").strip(), request.client.host if request.client else "")
@@ -57,14 +55,13 @@ async def begin(request: Request, settings: Configured) -> Response:
 
 
 @sign_in_router.post("/sign-out", dependencies=[needs("reader")])
-async def end(request: Request, caller: Asking) -> Response:
+async def end(request: Request, caller: Asking, access: Callers) -> Response:
     """End a sign-in; the form carries its CSRF token."""
     cookie = request.cookies.get(COOKIE)
     answer = _go(request, "/sign-in")
     if cookie is not None and caller.csrf is not None:
         form = await _form(request)
         refuse_without_token(caller, request.headers.get("x-csrf-token", form.get("csrf", "")))
-        access: Access = request.app.state.access
         await access.write(lambda session: sign_out(session, cookie))
         access.forget()
         answer.delete_cookie(COOKIE, path=_root(request) or "/", httponly=True, samesite="strict")

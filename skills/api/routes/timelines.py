@@ -2,48 +2,34 @@
 
 from typing import Annotated
 
-from fastapi import Query, Request, Response
+from fastapi import Query, Response
 
-from skills.api.authorisation import Asking, needs
-from skills.api.dependencies import (
-    Accept,
-    Db,
-    Digest,
-    Parse,
-)
+from skills.api.authorisation import needs
+from skills.api.dependencies import Accept, Db, Digest, Parse
 from skills.api.openapi import gives, router_of
-from skills.api.pages import render
-from skills.api.responses import JSON, Giving
-from skills.api.routes.pages import PageRoute
-from skills.errors import UnknownFormat
+from skills.api.responses import JSON, Giving, negotiate
+from skills.api.routes.pages import WebPage
+from skills.api.routes.pages import router as page_router
 from skills.formats import MCAP
 from skills.formats.bag_writer import timeline_mcap
 from skills.library.recordings.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.schemas.timelines import MotionTimeline
-from skills.settings import MEBIBYTE
 
-router = router_of(tags=["timelines"], max_body_size=MEBIBYTE)
-
-
-page_router = router_of(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
+router = router_of("timelines")
 
 
 SPAN, MOST_MARKS = r"^\d{1,6}(\.\d{1,6})?-\d{1,6}(\.\d{1,6})?$", 20
 
 
-@router.get(
-    "/timelines/{source}/{digest}",
-    dependencies=[needs("reader")],
-    **gives(MotionTimeline, 404, 409, 415, as_well=(MCAP,)),
-)
-def get_timeline(source: Source, digest: Digest, db: Db, tell: Parse, give: Giving, accept: Accept = "*/*") -> Response:
+@router.get("/timelines/{source}/{digest}", **gives("reader", MotionTimeline, 404, 409, 415, as_well=(MCAP,)))
+def get_timeline(source: Source, digest: Digest, db: Db, tell: Parse, give: Giving, accept: Accept) -> Response:
     """Return a recording, a demonstration, a learnt path or a plan as columns on one clock, to be played.
 
     At most 200 rows a second and 24,000 in all. `Accept: application/vnd.mcap` returns an MCAP file for viewers such as
     Foxglove, which is not for execution. 409: the surgeon's consent does not cover training, for a policy version or a
     plan, or an export, for the file of a recording or a demonstration; or somebody recorded allows no use.
     """
-    mcap = _is_mcap(accept)
+    mcap = negotiate(accept, "A timeline", JSON, MCAP) == MCAP
     if mcap:
         with db.reading() as session:
             check_export(session, source, digest)
@@ -55,27 +41,11 @@ def get_timeline(source: Source, digest: Digest, db: Db, tell: Parse, give: Givi
     return given
 
 
-def _is_mcap(accept: str) -> bool:
-    """Return whether the client names MCAP before JSON.
-
-    Raises:
-        UnknownFormat: It accepts neither.
-    """
-    for one in (part.partition(";")[0].strip().lower() for part in accept.split(",")):
-        if one == MCAP:
-            return True
-        if one in (JSON, "application/*", "*/*"):
-            return False
-    raise UnknownFormat(f"A timeline is available as {JSON} or {MCAP}; name one of them in Accept.")
-
-
 @page_router.get("/pages/player/{source}/{digest}", dependencies=[needs("reader")])
 def show_player(
     source: Source,
     digest: Digest,
-    request: Request,
-    caller: Asking,
-    db: Db,
+    page: WebPage,
     beside: Annotated[str | None, Query(max_length=100)] = None,
     mark: Annotated[list[Annotated[str, Query(pattern=SPAN)]] | None, Query(max_length=MOST_MARKS)] = None,
 ) -> Response:
@@ -83,10 +53,10 @@ def show_player(
 
     Each `mark` is a part to show, such as `1.5-2.25`: seconds on the clock of the first motion.
     """
-    with db.reading() as session:
+    with page.db.reading() as session:
         shown, choices = chosen(session, source, digest)
         other = motion_named(session, beside) if beside else None
         if other is not None and other not in choices:
             choices = [other, *choices]  # such as one of a link to an older demonstration than those of the list
         marks = [[float(end) for end in one.split("-")] for one in mark or ()]
-        return render(request, "player.html", caller, shown=shown, choices=choices, other=other, marks=marks)
+        return page.show("player.html", shown=shown, choices=choices, other=other, marks=marks)

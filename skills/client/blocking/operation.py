@@ -10,9 +10,9 @@ import httpx2 as httpx
 
 from skills.client.blocking.connection import Connection
 from skills.client.problems import JobFailed, JobTakesLonger, NotReached, NotUnderstood, Problem
-from skills.schemas.given import Ready, ServedAt, SignedCheckpoint
 from skills.schemas.operation import Job
 from skills.schemas.people import Key, NewKey
+from skills.schemas.responses import Ready, ServedAt, SignedCheckpoint
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 Kind = Literal["training", "retraining", "playback", "pictures", "dataset", "try"]

@@ -31,21 +31,8 @@ import numpy as np
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic
 from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
+from skills.formats import columns
 from skills.formats.archive import printable
-from skills.formats.columns import (
-    BASE,
-    POSE_PARTS,
-    SETPOINTS,
-    Parts,
-    Quantity,
-    check_outside,
-    in_mm,
-    pose_motion,
-    pose_of,
-    scaled,
-    setpoints_in,
-    topic_of,
-)
 from skills.formats.lerobot import INFO, STATEMENTS, VERSIONS, Dataset, Feature, Files, read_dataset
 from skills.formats.lerobot.parquet import ParquetTable, read_columns
 from skills.kinematics import INSTRUMENTS
@@ -105,7 +92,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         table = _read(dataset, meanings | commanded)
     except UnreadableRecording as error:
         table = _read(dataset, meanings)  # which raises if the fault is not one of setpoints
-        unknown += [(topic_of(*quantity), str(error)) for quantity in commanded]
+        unknown += [(columns.topic_of(*quantity), str(error)) for quantity in commanded]
         commanded = {}
     _check_one_episode(dataset, table)
     stamps_ns, clock = _stamps_ns(dataset, table)
@@ -113,19 +100,19 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
     values = _values(table, meanings)
     tools = _tools(dataset, table)
     joints = {
-        arm: Joints(arm, topic_of(arm, kind), stamps_ns, one[0])
+        arm: Joints(arm, columns.topic_of(arm, kind), stamps_ns, one[0])
         for (arm, kind), one in values.items()
         if kind == "joints"
     }
     motions, left_out = _motions(values, joints, tools, stamps_ns, _frames(dataset, frame, {arm for arm, _ in values}))
     instruments = {arm: number for arm, tool in tools.items() if (number := _number(tool)) is not None}
-    setpoints = setpoints_in(_values(table, commanded), motions, instruments, stamps_ns)
+    tips, jaw_setpoints, unusable = columns.setpoints_in(_values(table, commanded), motions, instruments, stamps_ns)
     return Recording(
         format="lerobot",
         integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
         motions=motions,
         jaws=tuple(
-            (arm, Signal(stamps_ns, one[0][:, 0], topic_of(arm, kind)))
+            (arm, Signal(stamps_ns, one[0][:, 0], columns.topic_of(arm, kind)))
             for (arm, kind), one in values.items()
             if kind == "jaw"
         ),
@@ -133,13 +120,13 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         joints=tuple(joints.values()),
         tools=tuple(sorted(tools.items())),
         notes=(*_notes(dataset, table), ("stamps", clock)),
-        left_out=(*left_out, *unknown, *setpoints.left_out),
-        setpoints=tuple(setpoints.tips),
-        jaw_setpoints=tuple(setpoints.jaws),
+        left_out=(*left_out, *unknown, *unusable),
+        setpoints=tuple(tips),
+        jaw_setpoints=tuple(jaw_setpoints),
     )
 
 
-def _read(dataset: Dataset, meanings: Mapping[Quantity, Mapping[int, Place]]) -> ParquetTable:
+def _read(dataset: Dataset, meanings: Mapping[columns.Quantity, Mapping[int, Place]]) -> ParquetTable:
     """Read the columns of some quantities, the scalars and the tools."""
     used = {feature for places in meanings.values() for feature, _ in places.values()} | {*_SCALARS, _SEC, _NANOSEC}
     features = [one for one in dataset.features if (one.name in used and not one.is_text) or _arms_of_tools(one)]
@@ -147,17 +134,22 @@ def _read(dataset: Dataset, meanings: Mapping[Quantity, Mapping[int, Place]]) ->
         return read_columns(file, [one.column for one in features])
 
 
-def _values(table: ParquetTable, meanings: Mapping[Quantity, Mapping[int, Place]]) -> dict[Quantity, Parts]:
+def _values(
+    table: ParquetTable, meanings: Mapping[columns.Quantity, Mapping[int, Place]]
+) -> dict[columns.Quantity, columns.Parts]:
     """Return the numbers of each quantity."""
-    values: dict[Quantity, Parts] = {}
+    values: dict[columns.Quantity, columns.Parts] = {}
     for (arm, kind), places in sorted(meanings.items()):
         numbers = table.stacked([place for _, place in sorted(places.items())])
         if kind.startswith("joint"):
-            values[arm, kind] = (in_mm(numbers),)
+            values[arm, kind] = (columns.in_mm(numbers),)
         elif kind.startswith("jaw"):
             values[arm, kind] = (numbers,)
         else:  # the recorders write metres
-            values[arm, kind] = (scaled(numbers[:, :3], 1000.0), *([numbers[:, 3:]] if numbers.shape[1] > 3 else []))
+            values[arm, kind] = (
+                columns.scaled(numbers[:, :3], 1000.0),
+                *([numbers[:, 3:]] if numbers.shape[1] > 3 else []),
+            )
     return values
 
 
@@ -202,7 +194,7 @@ def _check_one_episode(dataset: Dataset, table: ParquetTable) -> None:
 
 def _meanings(
     dataset: Dataset,
-) -> tuple[dict[Quantity, dict[int, Place]], dict[Quantity, dict[int, Place]], list[LeftOut]]:
+) -> tuple[dict[columns.Quantity, dict[int, Place]], dict[columns.Quantity, dict[int, Place]], list[LeftOut]]:
     """Return the columns of each measured quantity by component, those of setpoints, and the columns left out.
 
     Raises:
@@ -212,7 +204,7 @@ def _meanings(
     numeric = [one for one in dataset.features if not one.is_text and not one.is_picture]
     stated = _stated(dataset, numeric)
     taken = set(stated.values())
-    found: dict[Quantity, dict[int, Place]] = {}
+    found: dict[columns.Quantity, dict[int, Place]] = {}
     for (arm, kind, component), place in stated.items():
         found.setdefault((arm, kind), {})[component] = place
     unknown, faults = [], {}
@@ -225,24 +217,24 @@ def _meanings(
             place, names = (feature.name, index), feature.called(index)
             said = (meaning_of(name.removeprefix("action.") if action else name) for name in names)
             meaning = next((one for one in said if one is not None), None)
-            if meaning is None or (action and meaning[1] not in SETPOINTS):
+            if meaning is None or (action and meaning[1] not in columns.SETPOINTS):
                 nameless += [] if place in taken else [names[0]]
             elif meaning not in stated and place not in taken:
                 arm, kind, component = meaning
                 if found.setdefault((arm, kind), {}).setdefault(component, place) != place:
                     double = f"Two columns of the dataset are called {printable(names[0])!r}."
-                    if kind not in SETPOINTS:
+                    if kind not in columns.SETPOINTS:
                         raise BadColumns(double, Remedy(Action.NAME_FEATURES))
                     faults[arm, kind] = double
         if nameless and not action:
             unknown.append((feature.name[:NOTE_CHARACTERS], f"not used: {', '.join(nameless)}"[:NOTE_CHARACTERS]))
-    measured = {quantity: places for quantity, places in found.items() if quantity[1] not in SETPOINTS}
+    measured = {quantity: places for quantity, places in found.items() if quantity[1] not in columns.SETPOINTS}
     for quantity, places in sorted(measured.items()):
         if why := _incomplete(quantity, places):
             raise BadColumns(why)
-    commanded = {quantity: places for quantity, places in found.items() if quantity[1] in SETPOINTS}
+    commanded = {quantity: places for quantity, places in found.items() if quantity[1] in columns.SETPOINTS}
     faults |= {quantity: why for quantity, places in commanded.items() if (why := _incomplete(quantity, places))}
-    unknown += [(topic_of(*quantity), why) for quantity, why in faults.items()]
+    unknown += [(columns.topic_of(*quantity), why) for quantity, why in faults.items()]
     if not any(kind != "jaw" for _, kind in measured):
         listed = ", ".join(name for one in numeric for name in one.names or [one.name]) or "no named columns"
         raise NoUsableTopic(
@@ -256,7 +248,7 @@ def meaning_of(name: str) -> tuple[str, str, int] | None:
     """Return the arm, the quantity and the component that a column's name stands for; None for any other name."""
     if pose := _POSE.fullmatch(name):
         kind = ("local_" if pose[2] else "") + ("pose" if pose[3].lower() == "pose" else "setpoint")
-        return pose[1].upper(), kind, POSE_PARTS.index(pose[4].lower())
+        return pose[1].upper(), kind, columns.POSE_PARTS.index(pose[4].lower())
     if joint := _JOINT.fullmatch(name):
         which, kind = joint[3].lower(), "joint_setpoints" if joint[2] else "joints"
         return joint[1].upper(), kind, int(which) - 1 if which.isdecimal() else _JOINT_NAMES.index(which)
@@ -284,12 +276,12 @@ def _stated(dataset: Dataset, numeric: Sequence[Feature]) -> dict[tuple[str, str
     return stated
 
 
-def _incomplete(quantity: Quantity, places: Mapping[int, Place]) -> str | None:
+def _incomplete(quantity: columns.Quantity, places: Mapping[int, Place]) -> str | None:
     """Return the fault of a quantity with a missing column; a pose may have no orientation, a setpoint may not."""
     arm, kind = quantity
     if kind.startswith("jaw"):
         return None
-    names = _JOINT_NAMES if kind.startswith("joint") else POSE_PARTS
+    names = _JOINT_NAMES if kind.startswith("joint") else columns.POSE_PARTS
     count = 3 if kind in ("pose", "local_pose") and max(places) < 3 else len(names)
     missing = next((names[k] for k in range(count) if k not in places), None)
     return missing and f"The {kind} of {arm} has no column {missing}; all parts are needed."
@@ -299,7 +291,7 @@ def _incomplete(quantity: Quantity, places: Mapping[int, Place]) -> str | None:
 
 
 def _motions(
-    values: Mapping[Quantity, Parts],
+    values: Mapping[columns.Quantity, columns.Parts],
     joints: Mapping[str, Joints],
     tools: Mapping[str, str],
     stamps_ns: Ints,
@@ -319,16 +311,18 @@ def _motions(
             if number is None:
                 left_out.append((joints[arm].topic, f"no pose from joints: the instrument of {arm} is not known"))
             else:
-                local = pose_of(joints[arm].positions, number)
+                local = columns.pose_of(joints[arm].positions, number)
         if local is not None:
-            motions.append(replace(pose_motion(arm, "local_pose", base, stamps_ns, local), from_joints=computed))
+            motions.append(
+                replace(columns.pose_motion(arm, "local_pose", base, stamps_ns, local), from_joints=computed)
+            )
         if pose is not None and arm in frames:
-            motions.append(pose_motion(arm, "pose", frames[arm], stamps_ns, pose))
+            motions.append(columns.pose_motion(arm, "pose", frames[arm], stamps_ns, pose))
         elif pose is not None:
-            left_out.append((topic_of(arm, "pose"), "the dataset does not say in which frame it is"))
+            left_out.append((columns.topic_of(arm, "pose"), "the dataset does not say in which frame it is"))
     if motions:
         for motion in motions:
-            check_outside(motion)
+            columns.check_outside(motion)
         return tuple(motions), left_out
     if any(kind == "pose" for _, kind in values):
         raise BadColumns(
@@ -350,7 +344,7 @@ def _frames(dataset: Dataset, frame: str | None, arms: Collection[str]) -> dict[
         MixedFrames: The stated frame is another than in our own file.
     """
     frames = {arm: named for arm, named in dataset.statements.frames.items() if arm in arms}
-    stated = {} if frame is None else {arm: f"{arm}_base" if frame == BASE else frame for arm in arms}
+    stated = {} if frame is None else {arm: f"{arm}_base" if frame == columns.BASE else frame for arm in arms}
     wrong = sorted(arm for arm in frames if stated.get(arm, frames[arm]) != frames[arm])
     if wrong:
         raise MixedFrames(

@@ -11,6 +11,7 @@ The dataset is complete and verified before videos are added: of v2.1 one file p
 of the folder, with the episodes' times in them. Statistics of the pictures are those of the folder, where it has them.
 """
 
+import io
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,11 +27,12 @@ from skills.errors import BadInput, Corrupt
 from skills.formats.archive import Archive, printable
 from skills.formats.checksums import SUMS, digest_of, read_sums, write_sums
 from skills.formats.lerobot import INFO, Dataset, Json
-from skills.formats.lerobot.cut import EPISODES, Episode, cut_episode, episodes_of, find_dataset
+from skills.formats.lerobot.cut import EPISODES, cut_episode, episodes_of, find_dataset
 from skills.formats.lerobot.episode import episode_stamps
 from skills.formats.lerobot.parquet import open_parquet, read_rows
-from skills.formats.lerobot.writer import CHUNK, NO_PICTURES, joined_stats
+from skills.formats.lerobot.writer import CHUNK, NO_PICTURES, as_json, as_line, joined_stats
 from skills.formats.mp4 import Mp4, read_mp4
+from skills.packing import sha256
 
 V21_VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 V30_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -136,27 +138,16 @@ def find_recorded(
                 )
             _cameras(folder, dataset)
             for episode in episodes_of(dataset).values():
-                digest, source = _recorded(folder, dataset, episode, columns, tools)
-                found.setdefault(digest, source)
+                with TemporaryFile() as packed:
+                    cut_episode(dataset, episode, packed, columns=columns, tools=tools)
+                    packed.seek(0)
+                    digest = digest_of(packed)
+                    packed.seek(0)
+                    stamps_ns = episode_stamps(Archive(packed), "")
+                even_ns = np.arange(len(stamps_ns)) * (1e9 / fps)
+                drift = float(np.abs(stamps_ns - stamps_ns[0] - even_ns).max()) * fps / 1e9
+                found.setdefault(digest, EpisodeSource(folder, episode.number, len(stamps_ns), drift, fps))
     return found
-
-
-def _recorded(
-    folder: Path,
-    dataset: Dataset,
-    episode: Episode,
-    columns: Mapping[str, str] | None,
-    tools: Mapping[str, str] | None,
-) -> tuple[str, EpisodeSource]:
-    with TemporaryFile() as packed:
-        cut_episode(dataset, episode, packed, columns=columns, tools=tools)
-        packed.seek(0)
-        digest = digest_of(packed)
-        packed.seek(0)
-        stamps_ns = episode_stamps(Archive(packed), "")
-    even_ns = np.arange(len(stamps_ns)) * (1e9 / dataset.fps)
-    drift = float(np.abs(stamps_ns - stamps_ns[0] - even_ns).max()) * dataset.fps / 1e9
-    return digest, EpisodeSource(folder, episode.number, len(stamps_ns), drift, dataset.fps)
 
 
 def _cameras(folder: Path, dataset: Dataset) -> list[str]:
@@ -421,11 +412,11 @@ def add_videos(folder: Path, videos: Videos) -> None:
     info["video_path"] = V21_VIDEO if is_single else V30_VIDEO
     if is_single:
         info["total_videos"] = len(videos.clips) * len(videos.cameras)
-    _write(folder, INFO, json.dumps(info, indent=4, ensure_ascii=False, allow_nan=False), sums)
+    _write(folder, INFO, as_json(info), sums)
     readme = (folder / _README).read_text()
     if readme.count(NO_PICTURES) != 1:
         raise Corrupt("The README of the dataset has no sentence about pictures; update the command or the service.")
-    _write(folder, _README, readme.replace(NO_PICTURES, _words(videos)), sums)
+    _write(folder, _README, readme.replace(NO_PICTURES, _words(videos)).encode(), sums)
     (folder / SUMS).write_bytes(write_sums(sums))
 
 
@@ -451,8 +442,7 @@ def _complete_single(folder: Path, videos: Videos, sums: dict[str, str]) -> None
     stats = [json.loads(line) for line in (folder / _EPISODE_STATS).read_text().splitlines()]
     for number, one in enumerate(stats):
         one["stats"] |= {camera: _nested(found[number]) for camera, found in videos.stats.items()}
-    text = "".join(json.dumps(one, ensure_ascii=False, allow_nan=False) + "\n" for one in stats)
-    _write(folder, _EPISODE_STATS, text, sums)
+    _write(folder, _EPISODE_STATS, b"".join(map(as_line, stats)), sums)
 
 
 def _complete_shared(folder: Path, videos: Videos, sums: dict[str, str]) -> None:
@@ -479,11 +469,12 @@ def _complete_shared(folder: Path, videos: Videos, sums: dict[str, str]) -> None
         columns |= {f"stats/{camera}/{name}": [one[name] for one in nested] for name in (nested[0] if nested else ())}
         for name, values in columns.items():
             table = table.append_column(name, pa.array(values))
-    parquet.write_table(table, folder / _PLACES)
-    _add_sum(folder, _PLACES, sums)
+    with io.BytesIO() as file:
+        parquet.write_table(table, file)
+        _write(folder, _PLACES, file.getvalue(), sums)
     whole = json.loads((folder / _WHOLE_STATS).read_text())
     whole |= {camera: _nested(reduce(joined_stats, stats)) for camera, stats in videos.stats.items()}
-    _write(folder, _WHOLE_STATS, json.dumps(whole, indent=4, ensure_ascii=False, allow_nan=False), sums)
+    _write(folder, _WHOLE_STATS, as_json(whole), sums)
 
 
 def _check_lengths(videos: Videos, lengths: Sequence[int]) -> None:
@@ -517,11 +508,6 @@ def _copy(folder: Path, name: str, path: Path, videos: Videos, sums: dict[str, s
         raise Corrupt(f"{path} has changed while it was copied. Export again.")
 
 
-def _write(folder: Path, name: str, text: str, sums: dict[str, str]) -> None:
-    (folder / name).write_text(text)
-    _add_sum(folder, name, sums)
-
-
-def _add_sum(folder: Path, name: str, sums: dict[str, str]) -> None:
-    with (folder / name).open("rb") as file:
-        sums[name] = digest_of(file)
+def _write(folder: Path, name: str, data: bytes, sums: dict[str, str]) -> None:
+    (folder / name).write_bytes(data)
+    sums[name] = sha256(data)

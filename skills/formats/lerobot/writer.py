@@ -30,7 +30,7 @@ import numpy as np
 from jinja2 import Template
 from numpy.typing import NDArray
 
-from skills.arrays import Floats, Ints
+from skills.arrays import Floats, Ints, nearest
 from skills.demonstration.recording import Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
 from skills.formats.checksums import SUMS, digest_of, write_sums
@@ -185,24 +185,18 @@ def dataset_files(
 def _files(
     episodes: Iterable[ExportedEpisode], about: AboutDataset, version: Version
 ) -> Iterator[tuple[str, IO[bytes]]]:
-    store: _SingleFiles | _SharedFiles = _SingleFiles() if version == "v2.1" else _SharedFiles()
     total = _Total(about)
-    with store:
+    with TemporaryFile() as first, TemporaryFile() as second:
+        store = _SingleFiles(first, second) if version == "v2.1" else _SharedFiles(first, second)
         for episode in episodes:
             added = total.take(episode)
             yield from store.write(added)
         if not total.episodes:
             raise BadInput("There are no episodes to write.")
         yield from store.finish(total)
-    info = total.info(version)
-    yield INFO, _json(info)
-    yield (
-        STATEMENTS,
-        _json(
-            {"action": about.action, "frames": total.frames}
-            | ({} if about.export is None else {"export": about.export})
-        ),
-    )
+    yield INFO, io.BytesIO(as_json(total.info(version)))
+    export = {} if about.export is None else {"export": about.export}
+    yield STATEMENTS, io.BytesIO(as_json({"action": about.action, "frames": total.frames, **export}))
     yield "meta/README.md", io.BytesIO(_readme(about, total).encode())
     yield "videos/.keep", io.BytesIO()
 
@@ -212,8 +206,7 @@ class _EpisodeColumns:
     """An episode as columns, with its statistics."""
 
     number: int
-    tasks: tuple[str, ...]
-    task_index: int
+    task: str
     first: int  # frames of all episodes before it
     columns: dict[str, Numbers | list[str]]
     stats: Stats
@@ -260,7 +253,7 @@ class _Total:
         numbers = _stats_of(np.concatenate([*wide.values()], axis=1, dtype=np.float64))
         self.widths = {name: one.shape[1] for name, one in wide.items()}
         self.numbers = joined_stats(self.numbers, numbers) if number else numbers
-        added = _EpisodeColumns(number, (episode.task,), task, self.rows, columns, _by_column(numbers, self.widths))
+        added = _EpisodeColumns(number, episode.task, self.rows, columns, _by_column(numbers, self.widths))
         self.episodes, self.rows = number + 1, self.rows + rows
         return added
 
@@ -371,7 +364,7 @@ class _Series(NamedTuple):
 
     def at(self, times_ns: Ints, period_ns: float, episode: str) -> Floats:
         """Return the samples that are nearest to some times, lengths in m; shape (T, 7) or (T, 1)."""
-        chosen = _nearest(times_ns, self.stamps_ns)
+        chosen = nearest(self.stamps_ns, times_ns)
         off_ns = np.abs(self.stamps_ns[chosen] - times_ns)
         if off_ns.max() > period_ns:
             worst = int(np.argmax(off_ns))
@@ -392,14 +385,6 @@ def _series_of(motion: Motion, jaw: Signal) -> tuple[_Series, ...]:
     return poses, _Series(jaw.topic, jaw.stamps_ns, (jaw.values[:, None],))
 
 
-def _nearest(times_ns: Ints, stamps_ns: Ints) -> Ints:
-    after = np.clip(np.searchsorted(stamps_ns, times_ns), 1, max(1, len(stamps_ns) - 1))
-    before = after - 1
-    after = np.minimum(after, len(stamps_ns) - 1)
-    chosen: Ints = np.where(times_ns - stamps_ns[before] <= stamps_ns[after] - times_ns, before, after)
-    return chosen
-
-
 def _stages(recording: Recording, times_ns: Ints) -> list[str]:
     """Return the name of the stage or gesture at each time, "" where there is none; the later label counts."""
     names = np.full(len(times_ns), "", dtype=object)
@@ -414,12 +399,7 @@ def _stages(recording: Recording, times_ns: Ints) -> list[str]:
 
 def _stats_of(values: Floats) -> dict[str, list[float]]:
     """Return the statistics of the numbers of all columns, shape (rows, numbers): together, because that is faster."""
-    stats = {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
-    }
+    stats = {name: getattr(values, name)(axis=0) for name in ("min", "max", "mean", "std")}
     quantiles = dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values()), axis=0), strict=True))
     return {name: one.tolist() for name, one in (stats | quantiles).items()} | {"count": [len(values)]}
 
@@ -449,16 +429,12 @@ def joined_stats(one: Mapping[str, list[float]], other: Mapping[str, list[float]
 # ---- files of each version -----------------------------------------------------------------------------------------
 
 
+@dataclass
 class _SingleFiles:
-    """The files of v2.1: one of data per episode, and lines about the episodes."""
+    """The files of v2.1: one of data per episode, and lines about the episodes, in two temporary files."""
 
-    def __enter__(self) -> "_SingleFiles":
-        self._episodes, self._stats = TemporaryFile(), TemporaryFile()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._episodes.close()
-        self._stats.close()
+    _episodes: IO[bytes]
+    _stats: IO[bytes]
 
     def write(self, added: _EpisodeColumns) -> Iterator[tuple[str, IO[bytes]]]:
         """Yield the file of an episode."""
@@ -467,33 +443,34 @@ class _SingleFiles:
         with io.BytesIO() as file:
             parquet.write_table(_table(added), file)
             yield _V21_DATA.format(episode_chunk=added.number // CHUNK, episode_index=added.number), file
-        about = {"episode_index": added.number, "tasks": added.tasks, "length": added.rows}
+        about = {"episode_index": added.number, "tasks": [added.task], "length": added.rows}
         plain = {name: {key: one[key] for key in one if key not in QUANTILES} for name, one in added.stats.items()}
-        self._episodes.write(_line(about))
-        self._stats.write(_line({"episode_index": added.number, "stats": plain}))
+        self._episodes.write(as_line(about))
+        self._stats.write(as_line({"episode_index": added.number, "stats": plain}))
 
     def finish(self, total: _Total) -> Iterator[tuple[str, IO[bytes]]]:
         """Yield the files about all episodes."""
         yield "meta/episodes.jsonl", self._episodes
         yield "meta/episodes_stats.jsonl", self._stats
-        lines = (_line({"task_index": number, "task": task}) for task, number in total.tasks.items())
+        lines = (as_line({"task_index": number, "task": task}) for task, number in total.tasks.items())
         yield TASK_LINES, io.BytesIO(b"".join(lines))
 
 
+@dataclass
 class _SharedFiles:
-    """The files of v3.0: data of many episodes in a file, each a row group, and a table of the episodes."""
+    """The files of v3.0: data of many episodes in a file, each a row group, and a table of the episodes.
 
-    def __enter__(self) -> "_SharedFiles":
-        self._data, self._table = TemporaryFile(), TemporaryFile()
-        self._writer: Any = None
-        self._table_writer: Any = None
-        self._waiting: list[Json] = []
-        self._file, self._bytes, self._episodes = 0, 0, 0
-        return self
+    Both are written in temporary files, that of the data again and again.
+    """
 
-    def __exit__(self, *_: object) -> None:
-        self._data.close()
-        self._table.close()
+    _data: IO[bytes]
+    _table: IO[bytes]
+    _writer: Any = None
+    _table_writer: Any = None
+    _waiting: list[Json] = field(default_factory=list)
+    _file: int = 0
+    _bytes: int = 0
+    _episodes: int = 0
 
     def write(self, added: _EpisodeColumns) -> Iterator[tuple[str, IO[bytes]]]:
         """Add an episode; yield the data file that is full."""
@@ -509,7 +486,7 @@ class _SharedFiles:
         self._bytes, self._episodes = self._bytes + table.nbytes, self._episodes + 1
         place = {
             "episode_index": added.number,
-            "tasks": list(added.tasks),
+            "tasks": [added.task],
             "length": added.rows,
             "data/chunk_index": self._file // CHUNK,
             "data/file_index": self._file % CHUNK,
@@ -537,7 +514,7 @@ class _SharedFiles:
         with io.BytesIO() as file:
             parquet.write_table(tasks, file)
             yield TASK_TABLE, file
-        yield "meta/stats.json", _json(_by_column(total.numbers, total.widths))
+        yield "meta/stats.json", io.BytesIO(as_json(_by_column(total.numbers, total.widths)))
 
     def _finished_file(self) -> Iterator[tuple[str, IO[bytes]]]:
         self._writer.close()
@@ -588,11 +565,13 @@ def _table(added: _EpisodeColumns) -> Any:
     return pa.table(arrays)
 
 
-def _json(value: object) -> IO[bytes]:
-    return io.BytesIO(json.dumps(value, indent=4, ensure_ascii=False, allow_nan=False).encode())
+def as_json(value: object) -> bytes:
+    """Return a value as the contents of a file, as LeRobot indents it."""
+    return json.dumps(value, indent=4, ensure_ascii=False, allow_nan=False).encode()
 
 
-def _line(value: object) -> bytes:
+def as_line(value: object) -> bytes:
+    """Return a value as a line of a file."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False).encode() + b"\n"
 
 

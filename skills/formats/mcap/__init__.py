@@ -24,16 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import (
-    Joints,
-    Motion,
-    Recording,
-    Signal,
-    Topic,
-    recorded_joints,
-    recorded_motion,
-    recorded_signal,
-)
+from skills.demonstration import recording
 from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats import topics
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Field, Wanted, fields_of
@@ -68,7 +59,7 @@ class NeedsRosbags(UnreadableRecording):
     """A valid file with message types that only rosbags can read; `numbers["integrity"]` is the file's integrity."""
 
 
-def read_mcap(file: BinaryIO, meaning: MeaningOf = topics.meaning) -> Recording:
+def read_mcap(file: BinaryIO, meaning: MeaningOf = topics.meaning) -> recording.Recording:
     """Read the used topics of a dVRK recording.
 
     Args:
@@ -206,65 +197,50 @@ def _ros2_name(name: str) -> str:
     return name.replace("/", "/msg/") if name.count("/") == 1 else name
 
 
-def _recording(log: _Log) -> Recording:
-    motions, masters, joints, tools, setpoints = [], [], [], [], []
-    signals: dict[TopicKind, dict[str, Signal]] = {kind: {} for kind in TopicKind}
+def _recording(log: _Log) -> recording.Recording:
+    found: dict[TopicKind, list[tuple[str, Any]]] = {kind: [] for kind in TopicKind}  # owners and their values
     for topic in sorted(log.topics.values(), key=lambda topic: topic.name):
-        if not topic.columns:
-            continue
         kind, owner = topic.meaning.kind, topic.meaning.owner
         try:
-            if kind is TopicKind.MOTION:
-                motions.append(_motion(topic))
-            elif kind is TopicKind.MASTER:
-                masters.append(_motion(topic))
-            elif kind is TopicKind.SETPOINT:
-                setpoints.append(_motion(topic))
-            elif kind is TopicKind.JOINTS:
-                joints.append(_joints(topic))
-            elif kind is TopicKind.TOOL:
-                tools.append((owner, _tool(topic)))
-            else:
-                signals[kind][owner] = _signal(topic)
+            if topic.columns:
+                found[kind].append((owner, _MAKERS.get(kind, _signal)(topic)))
         except SkillsError as error:
             log.leave_out(topic, error)
-    pedals = signals[TopicKind.PEDAL]
-    return Recording(
-        format="mcap",
-        integrity=log.walker.integrity,
-        motions=tuple(motions),
-        jaws=tuple(signals[TopicKind.JAW].items()),
-        clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
-        topics=_topics(log),
-        joints=tuple(joints),
-        masters=tuple(masters),
-        grippers=tuple(signals[TopicKind.GRIPPER].items()),
-        pedals=tuple(pedals.items()),
-        following=tuple(signals[TopicKind.FOLLOWING].items()),
-        scales=tuple(signals[TopicKind.SCALE].items()),
-        tools=tuple(tools),
-        notes=tuple(sorted(log.walker.notes.items())),
-        left_out=tuple(sorted(log.left_out.items())),
-        setpoints=tuple(setpoints),
-        jaw_setpoints=tuple(signals[TopicKind.JAW_SETPOINT].items()),
-    )
-
-
-def _topics(log: _Log) -> tuple[Topic, ...]:
+    values = {kind: tuple(value for _, value in of_kind) for kind, of_kind in found.items()}
+    signals = {kind: tuple(dict(of_kind).items()) for kind, of_kind in found.items()}  # the last one of each owner
+    pedals = dict(signals[TopicKind.PEDAL])
     counts: Counter[tuple[str, str]] = Counter()
     for number, channel in log.walker.channels.items():
         counts[channel.topic, log.type_of(channel)] += log.walker.counts[number]
-    return tuple(Topic(name, message_type, count) for (name, message_type), count in sorted(counts.items()))
+    return recording.Recording(
+        format="mcap",
+        integrity=log.walker.integrity,
+        motions=values[TopicKind.MOTION],
+        jaws=signals[TopicKind.JAW],
+        clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
+        topics=topics.counted(counts),
+        joints=values[TopicKind.JOINTS],
+        masters=values[TopicKind.MASTER],
+        grippers=signals[TopicKind.GRIPPER],
+        pedals=signals[TopicKind.PEDAL],
+        following=signals[TopicKind.FOLLOWING],
+        scales=signals[TopicKind.SCALE],
+        tools=tuple(found[TopicKind.TOOL]),
+        notes=tuple(sorted(log.walker.notes.items())),
+        left_out=tuple(sorted(log.left_out.items())),
+        setpoints=values[TopicKind.SETPOINT],
+        jaw_setpoints=signals[TopicKind.JAW_SETPOINT],
+    )
 
 
 # ---- from columns to values -------------------------------------------------------------------------------------
 
 
-def _motion(topic: _Topic) -> Motion:
+def _motion(topic: _Topic) -> recording.Motion:
     stamps_ns, poses = _in_order(topic)
     with np.errstate(over="ignore"):  # infinite values are refused below
         tip_mm = 1000.0 * poses[:, :3]  # ROS messages are in metres
-    return recorded_motion(
+    return recording.recorded_motion(
         arm=topic.meaning.owner,
         topic=topic.name,
         frame=_one_frame(topic),
@@ -286,23 +262,23 @@ def _one_frame(topic: _Topic) -> str:
     return frames[0]
 
 
-def _joints(topic: _Topic) -> Joints:
+def _joints(topic: _Topic) -> recording.Joints:
     stamps_ns, positions = _in_order(topic)
     if topic.meaning.owner.upper().startswith("PSM"):
         if positions.shape[1] <= INSERTION:
             raise NoUsableTopic(f"{topic.name} has {positions.shape[1]} joints; a PSM has 6.", topic=topic.name)
         with np.errstate(over="ignore"):  # infinite values are refused below
             positions[:, INSERTION] *= 1000.0  # ROS messages are in metres
-    return recorded_joints(topic.meaning.owner, topic.name, stamps_ns, positions)
+    return recording.recorded_joints(topic.meaning.owner, topic.name, stamps_ns, positions)
 
 
-def _signal(topic: _Topic) -> Signal:
+def _signal(topic: _Topic) -> recording.Signal:
     stamps_ns, values = _in_order(topic)
     if values.shape[1] == 0:
         raise NoUsableTopic(
             f"{topic.name} has messages without a value; remove the topic from the recording.", topic=topic.name
         )
-    make = recorded_signal if topic.meaning.kind in _ANGLES else Signal
+    make = recording.recorded_signal if topic.meaning.kind in _ANGLES else recording.Signal
     return make(stamps_ns, values[:, 0], topic.name)
 
 
@@ -314,6 +290,13 @@ def _tool(topic: _Topic) -> str:
     if len(last) > TOOL_LIMIT or not last.isprintable():
         raise NoUsableTopic(f"{topic.name} names no instrument; remove the topic from the recording.", topic=topic.name)
     return last
+
+
+_MAKERS: dict[TopicKind, Callable[[_Topic], Any]] = {  # of all other kinds `_signal`
+    **dict.fromkeys((TopicKind.MOTION, TopicKind.MASTER, TopicKind.SETPOINT), _motion),
+    TopicKind.JOINTS: _joints,
+    TopicKind.TOOL: _tool,
+}
 
 
 def _in_order(topic: _Topic) -> tuple[Ints, Floats]:

@@ -52,7 +52,7 @@ NOTES = "suture-skills"  # the metadata record in which our own writer notes a f
 
 _CHUNK: Final = struct.Struct("<QQQI")  # first and last time, size, checksum; compression and data follow
 _STATISTICS: Final = struct.Struct("<QHIIIIQQI")
-_PART_BYTES = 8 * 2**20  # fits a processor's cache, and is large enough for numpy to be efficient
+_PART_BYTES = 4 * 2**20  # fits a processor's cache, and is large enough for numpy to be efficient
 _FOOTER: Final = struct.Struct("<QQ")  # positions of the summary and of its offsets; a checksum follows
 _SUMMARY = (
     *(Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET),

@@ -90,7 +90,7 @@ def read_cohort(folder: Path, *, tasks: Sequence[str] = (), progress: Callable[[
         left_out=len(trials) - len(used),
         surgeons=len(users),
         trials=len(used),
-        files=sorted(map(_digest, {trial.kinematics for trial in trials} | {_meta(trial) for trial in trials})),
+        files=sorted(map(_digest, {trial.kinematics for trial in trials} | {trial.meta for trial in trials})),
     )
     left_out = {
         "rated, but without a kinematics file": _without_file(trials),
@@ -201,7 +201,7 @@ def _check_ratings(trials: Sequence[Trial]) -> None:
     Raises:
         BadInput: The file of ratings is missing, has none of these trials, or has one that cannot be read.
     """
-    meta = _meta(trials[0])
+    meta = trials[0].meta
     if not meta.is_file():
         raise BadInput(
             f"There is no {meta}; it must have the ratings, one line per trial: TASK_B001, N, 13, 3 2 1 2 2 3."
@@ -232,13 +232,9 @@ def _counts(used: Sequence[tuple[Trial, jigsaws.RatedTrial]]) -> TaskCounts:
 
 def _without_file(trials: Sequence[Trial]) -> list[str]:
     """Return the names of the trials that have a rating and no file."""
-    texts = [meta.read_text(errors="replace") for meta in {_meta(trial) for trial in trials}]
+    texts = [meta.read_text(errors="replace") for meta in {trial.meta for trial in trials}]
     listed = {name for text in texts for name in jigsaws.read_meta(text)}
     return sorted(listed - {trial.name for trial in trials})
-
-
-def _meta(trial: Trial) -> Path:
-    return trial.kinematics.parents[2] / f"meta_file_{trial.task}.txt"
 
 
 def _measured(trial: Trial) -> TrialFigures | None:

@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
+from skills.comparison.combining import Combining
 from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import ALL_ROWS
@@ -164,7 +165,7 @@ class TrainingRequest(TypedDict):
     near: dict[str, float]  # of the gate
     seed: int
     release: bool
-    combine: NotRequired[dict[str, str]]  # of several demonstrations
+    combine: NotRequired[dict[Literal["kind"], Combining]]  # of several demonstrations
     outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
     depth_along: NotRequired[list[float]]  # in a frame that is not the base of the arm
     surroundings: NotRequired[dict[str, Any]]  # the scene and its costs
@@ -306,6 +307,11 @@ def progress_callback(database: Database, kind: str, request: Mapping[str, objec
 def did_nothing(job: Job) -> str:
     """Return the sentence that a request had no effect because an equal job exists."""
     return f"Nothing: an equal job {'has succeeded' if job.state == 'succeeded' else f'is {job.state}'} already."
+
+
+def requested(job: Job, new: bool) -> RequestedJob:
+    """Return a requested job with the effect of the request: it is queued, or existed."""
+    return RequestedJob(job, new, QUEUED if new else did_nothing(job))
 
 
 def refuse_too_many(session: Session, actor: str, most: int) -> None:

@@ -27,7 +27,7 @@ from skills.db.session import Database
 from skills.errors import Busy, NotFound
 from skills.library.operation.history import covered_leaf, logged_leaf, sign_history
 from skills.library.people.surgeons import find_surgeon
-from skills.schemas.given import LeafProof, ServedAt, SignedCheckpoint
+from skills.schemas.responses import LeafProof, ServedAt, SignedCheckpoint
 from skills.transparency.merkle import Checkpoint
 from skills.transparency.notes import Note, read_notes
 from skills.transparency.statements import attest

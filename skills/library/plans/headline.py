@@ -46,7 +46,7 @@ def headline(plan: PlanDescription, report: Verdict, *, errors: ArmErrors, lower
     level = _level(plan, feasible, whole, lower_bound)
     word = _word(plan, feasible, level)
     exact = f"feasible in an exact simulation{odds}"
-    verdict = exact if feasible else report.failure_in_words
+    verdict = exact if feasible else report.failure_sentence
     return Headline(
         level=level,
         word=word,
@@ -68,9 +68,9 @@ def judged_under(report: Verdict, errors: ArmErrors) -> EstimateUnder:
         Conflict: The verdict is of another version of the checks or of the judge; or the installation states other
             errors since.
     """
-    if (report.check_version, report.doubt.version) != (CHECK_VERSION, JUDGE_VERSION):
+    if (report.check_version, report.estimate.version) != (CHECK_VERSION, JUDGE_VERSION):
         raise Conflict("This plan was judged by another version of the checks; play it again.")
-    stated = report.doubt.under[0]
+    stated = report.estimate.under[0]
     if report.stated_by != "request" and stated.errors != errors:
         raise Conflict(
             f"This plan was judged with {describe_errors(stated.errors.name)}, which the installation stated "
@@ -81,7 +81,7 @@ def judged_under(report: Verdict, errors: ArmErrors) -> EstimateUnder:
 
 def costs_most(report: Verdict) -> str | None:
     """Return the sentence on the error that costs the most; None where no error was judged by itself."""
-    doubted = report.doubt
+    doubted = report.estimate
     if not (costs := doubted.costs):
         return None
     first, whole = costs[0], doubted.under[0].plan

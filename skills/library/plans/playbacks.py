@@ -87,10 +87,10 @@ def check_playback(
     report = finite(
         Verdict(
             **vars(verdict.report),
-            doubt=verdict.success,
+            estimate=verdict.success,
             stated_by=request["stated_by"],
             check_version=request["check_version"],
-            failure_in_words=verdict.failure_sentence,
+            failure_sentence=verdict.failure_sentence,
             scene=verdict.scene,
             tissue="not given" if plan.scene is None or plan.scene.tissue is None else "judged",
             plan=request["plan"],

@@ -155,7 +155,7 @@ def _written(paper: dict[str, Any]) -> bytes:
 
 def _readme(row: Plan, about: PlanDescription, report: Verdict, arms: tuple[ArmMotion, ...], head: Note) -> str:
     """Return the text of the bag's README: its contents, and the figures of each arm to check before it moves."""
-    under, policy = report.doubt.under[0], row.policy
+    under, policy = report.estimate.under[0], row.policy
     errors = under.errors
     well = "succeed" if counted_as(under) == "hand-over" else "stay within reach and clear"
     lines = [

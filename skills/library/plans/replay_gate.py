@@ -88,7 +88,7 @@ def cleared(session: Session, row: Plan, plan: SuturePlan, conditions: ReplayCon
     if (played.report.plan, played.report.identity) != (row.sha256, played.sha256):
         raise Corrupt("A stored verdict does not match its digest; restore it from a backup.")
     if not (played.feasible and played.report.feasible):
-        raise Conflict(f"The simulator found this plan infeasible: {played.report.failure_in_words} Change the plan.")
+        raise Conflict(f"The simulator found this plan infeasible: {played.report.failure_sentence} Change the plan.")
     check_probability(played.report, errors=conditions.errors, lower_bound=conditions.lower_bound)
     return played
 

@@ -82,7 +82,7 @@ def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
         # What it reported may have been withdrawn or erased since, so it is tried again, not looked up.
         request["again"] = secrets.token_hex(8)
     job, new = jobs.ask(session, TRY, request, surgeon, actor)
-    return RequestedJob(job, new, jobs.QUEUED if new else jobs.did_nothing(job))
+    return jobs.requested(job, new)
 
 
 def perform_try(database: Database, request: dict[str, Any], settings: Settings) -> Store:
@@ -422,7 +422,7 @@ def _play(database: Database, asked: TryIn, plan: str, actor: str, settings: Set
         playback = store(session, actor)["playback"]
     with database.reading() as session:
         row = find_playback(session, playback)
-    errors = row.report.doubt.under[0].errors.name
+    errors = row.report.estimate.under[0].errors.name
     words = f"{row.report.samples} samples in the simulator, and 1000 worlds with {describe_errors(errors)}."
     return playback, words
 

@@ -163,7 +163,7 @@ class _Batch:
         if style.served is not None and style.served.surroundings is not None:
             request |= {"surroundings": style.served.surroundings.as_json(), "odds": shared["odds"]}
         if how is not None:
-            request["combine"] = {"kind": how.kind}
+            request["combine"] = {"kind": how}
         return request
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
-from skills.comparison.combining import COMBININGS, Combined, Combining, Corridor, Followed, followed
+from skills.comparison.combining import Combined, Combining, Followed, followed
 from skills.db.models import Demonstration, PolicyVersion, Surgeon
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, Conflict
@@ -20,7 +20,7 @@ from skills.schemas.policies import Combined as CombinedFigures
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
 
 
-BEST = Corridor()  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
+BEST: Combining = "corridor"  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
 
 
 def choose_demos(
@@ -85,11 +85,6 @@ def refuse_unlike(demonstrations: Sequence[Demonstration]) -> None:
             )
 
 
-def combining_of(kind: str) -> Combining:
-    """Return the way of combining of a kind."""
-    return COMBININGS[kind]()
-
-
 def describe_combined(found: Followed, how: Combining, demos: Sequence[str]) -> CombinedFigures:
     """Return the description of a combination: its kind, its medoid, and the widths and distances of the combined path.
 
@@ -100,7 +95,7 @@ def describe_combined(found: Followed, how: Combining, demos: Sequence[str]) -> 
     """
     combined = found.combined
     return CombinedFigures(
-        kind=how.kind,
+        kind=how,
         medoid=demos[combined.medoid],
         at=demos[combined.at],
         moved=combined.moved,
@@ -131,4 +126,4 @@ def _followed(version: PolicyVersion) -> Followed | None:
     if (combined := version.manifest.combined) is None:
         return None
     rows = version.demonstrations
-    return followed([one.demo for one in rows], [one.path for one in rows], combining_of(combined.kind))
+    return followed([one.demo for one in rows], [one.path for one in rows], combined.kind)

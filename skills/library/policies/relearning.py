@@ -30,7 +30,6 @@ from skills.learning.tube import CertifiedPoses
 from skills.library.operation.integrity import learnt
 from skills.library.operation.jobs import TrainingRequest
 from skills.library.people.consent import refusal
-from skills.library.policies.combined import combining_of
 from skills.library.policies.gate import GATE_VERSION, limits_of
 from skills.library.policies.learning import ANY, Learnt, Lesson, certified, combined_lesson, learn_style, lessons
 from skills.library.policies.training import POSES_VERSION
@@ -202,7 +201,7 @@ class _Stored:
     def lesson(self, found: list[Lesson]) -> Lesson:
         """Return what the version was learnt from, with the outcomes that its demonstrations had then."""
         combined, outcomes = self.manifest.combined, self.manifest.outcomes
-        lesson = found[0] if combined is None else combined_lesson(found, combining_of(combined.kind))
+        lesson = found[0] if combined is None else combined_lesson(found, combined.kind)
         return lesson if outcomes is None else replace(lesson, outcomes=tuple(outcomes))
 
     def differing(self, made: Learnt, *, numbers_only: bool = False) -> tuple[str, ...]:

@@ -181,7 +181,7 @@ def _made_of(session: Session, demo: "_Newest", served: ServedSettings | None, a
         return [None, [demo.sha256], None, None]
     kind, demos = None, [demo.sha256]
     if served.combining is not None:
-        kind, newest = served.combining.kind, newest_demos(session, demo.surgeon_row, demo.suture, served.demos)
+        kind, newest = served.combining, newest_demos(session, demo.surgeon_row, demo.suture, served.demos)
         demos = [one.sha256 for one in newest]
     rule = served.join_share if asked["joins"] == JOIN_AS_SERVED else None
     return [kind, demos, rule, None if served.surroundings is None else served.surroundings.as_json()]

@@ -12,7 +12,6 @@ from skills.db.models import PolicyVersion, Release
 from skills.gridworld.hazards import Surroundings
 from skills.learning.policy import describe_learner
 from skills.library.operation.jobs import JOIN_AS_SERVED, RetrainingRequest
-from skills.library.policies.combined import combining_of
 from skills.library.policies.outcomes import Style
 from skills.library.policies.releases import is_served
 from skills.schemas.policies import PolicyManifest
@@ -47,7 +46,7 @@ class ServedSettings:
             join_share=learner.join_share or None,
             surroundings=manifest.surroundings,
             demos=len(manifest.demos),
-            combining=None if manifest.combined is None else combining_of(manifest.combined.kind),
+            combining=None if manifest.combined is None else manifest.combined.kind,
         )
 
 

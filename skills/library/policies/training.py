@@ -44,7 +44,7 @@ from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
-from skills.library.policies.combined import BEST, choose_demos, combining_of
+from skills.library.policies.combined import BEST, choose_demos
 from skills.library.policies.gate import GATE_VERSION
 from skills.library.policies.learning import ANY, combined_lesson, learn_style, lessons, store_style, with_partners
 from skills.library.policies.versions import find_by_digest
@@ -119,7 +119,7 @@ def training_request(
         "release": training.release,
     }
     if len(chosen) > 1:
-        request["combine"] = {"kind": (training.combining or BEST).kind}
+        request["combine"] = {"kind": training.combining or BEST}
     elif training.combining is not None:
         raise BadInput("A single demonstration is not combined; name several in `demos`, or omit `combine`.")
     if any_outcome:
@@ -194,7 +194,7 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if a recording is not cached
         found = with_partners(database, found, reader.parse)
-    lesson = combined_lesson(found, combining_of(request["combine"]["kind"])) if "combine" in request else found[0]
+    lesson = combined_lesson(found, request["combine"]["kind"]) if "combine" in request else found[0]
     learnt = learn_style(lesson, request, settings, jobs.progress_callback(database, "training", request))
 
     def store(session: Session, actor: str) -> dict[str, Any]:

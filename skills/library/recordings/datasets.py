@@ -294,7 +294,7 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
             frames = write_dataset(file, exported, about, cast(Version, request["version"]), settings)
         size_bytes = file.tell()
         file.seek(0)
-        made = file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+        made = file_digest(file, "sha256").hexdigest()
         until_stored = opened.pop_all()
 
     def store(session: Session, actor: str) -> dict[str, Any]:

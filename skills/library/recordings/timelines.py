@@ -60,7 +60,7 @@ def timeline_of(database: Database, source: Source, sha256: str, parse: Parser) 
         plan = followed_plan(session, sha256)
         motion = planned(plan)
         played = session.scalar(newest(StoredPlayback, StoredPlayback.plan_row == plan.row))
-        measured, passes = (None, ()) if played is None else (played.measured, played.report.doubt.under[0].passes)
+        measured, passes = (None, ()) if played is None else (played.measured, played.report.estimate.under[0].passes)
     odds = {number: one.succeeds.probability for number, one in enumerate(passes)}
     return timeline_of_plan(trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds)
 
