@@ -4,7 +4,7 @@ from itertools import count, islice
 
 from sqlalchemy import func, select, text
 
-from skills.db.models import PolicyVersion, SutureType
+from skills.db.models import Demonstration, PolicyVersion, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.formats.parsed import parse_recording
@@ -12,6 +12,7 @@ from skills.learning.policy import describe_learner
 from skills.library.operation.jobs import PART
 from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
+from skills.library.policies.releases import in_force
 from skills.library.policies.retraining import request_retraining
 from skills.library.recordings import demos
 from skills.library.recordings.content_cache import entry_of
@@ -106,3 +107,10 @@ def counted(database: Database, table: type) -> int:
     """Count the rows of a table."""
     with database.reading() as session:
         return session.scalar(select(func.count()).select_from(table))
+
+
+def served(database: Database) -> list[int]:
+    """Return the versions of all releases that stand of the only surgeon, the newest first."""
+    with database.reading() as session:
+        (surgeon,) = session.scalars(select(Demonstration.surgeon_row).distinct())
+        return [one.policy.version for one in in_force(session, surgeon, cases.SUTURE)]

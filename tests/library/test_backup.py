@@ -1,7 +1,7 @@
 """Backups: during writes, between the back ends, damaged, of other versions; and erasures persist."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,21 +27,6 @@ from tests.api.service import Service
 from tests.jobs.house import House
 from tests.library import cases
 from tests.library.cases import commit, wrong
-
-
-@pytest.fixture
-def empty(tmp_path: Path) -> Iterator[Callable[[str], Database]]:
-    """Yield a function that creates databases without tables."""
-    made: list[Database] = []
-
-    def make(backend: str) -> Database:
-        made.append(Database(backends.blank(backend, tmp_path)))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
-        backends.drop(one.url)
 
 
 def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:

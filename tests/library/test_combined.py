@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sqlalchemy import select
 
 from skills.comparison.combining import COMBININGS
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release
@@ -22,7 +21,7 @@ from skills.library.plans.plans import hand_of, trajectory_of
 from skills.library.policies import training
 from skills.library.policies.cards import card_of
 from skills.library.policies.combined import learnt_from, path_of
-from skills.library.policies.releases import in_force, release
+from skills.library.policies.releases import release
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import upload_demo, withdraw_demo
 from skills.schemas.demos import DemoIn
@@ -32,7 +31,7 @@ from skills.verification.requested import requested_motion
 from tests import backends
 from tests.library import cases
 from tests.library.cases import commit, fetch, wrong
-from tests.library.styles import counted, retrain
+from tests.library.styles import counted, retrain, served
 
 SHIFTS_MM = ((0.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 1.5, 0.5))
 GONE = pytest.mark.parametrize(  # the demonstration that the policy's row names, and another one
@@ -47,12 +46,6 @@ def add_three(database: Database) -> list[Demonstration]:
 
 def train(database: Database, demos: list[Demonstration], **asked) -> PolicyVersion:
     return cases.train(database, demos=[demo.sha256 for demo in demos], **asked)
-
-
-def served(database: Database) -> list[int]:
-    with database.reading() as session:
-        (surgeon,) = session.scalars(select(Demonstration.surgeon_row).distinct())
-        return [one.policy.version for one in in_force(session, surgeon, cases.SUTURE)]
 
 
 @HOWS

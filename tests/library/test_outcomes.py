@@ -1,6 +1,6 @@
 """Outcomes of demonstrations: who may learn from a failure, and what a mark ends."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,7 @@ from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
 from skills.library.policies.gate import remedy
-from skills.library.policies.releases import in_force, release
+from skills.library.policies.releases import release
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256
@@ -32,7 +32,7 @@ from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
 from tests.library.cases import commit, fetch, wrong
-from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, styles_of
+from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, served, styles_of
 
 WHY = "The needle fell."
 FAILED = pytest.mark.parametrize("outcome", ["recovery", "failure"])
@@ -44,13 +44,6 @@ def add(database: Database, shift_mm: float = 0.0, **cut: object) -> Demonstrati
 
 def mark(database: Database, demo: Demonstration, outcome: str, reason: str | None = WHY) -> Demonstration:
     return commit(database, mark_demo, demo.sha256, outcome, reason, "test")
-
-
-def served(database: Database) -> list[int]:
-    """Return the versions of all releases that stand, the newest first."""
-    with database.reading() as session:
-        (surgeon,) = session.scalars(select(Demonstration.surgeon_row).distinct())
-        return [one.policy.version for one in in_force(session, surgeon, cases.SUTURE)]
 
 
 def release_again(database: Database, version: PolicyVersion) -> None:
@@ -367,38 +360,30 @@ def test_a_failure_is_compared_only_if_named_and_in_no_percentile(database: Data
 # ---- backups
 
 
-def restored(database: Database, folder: Path, *, listed: bool = True) -> Database:
-    """Restore `b.zip` into a new database of the other back end."""
-    other = {"sqlite": "postgresql", "postgresql": "sqlite"}[database.engine.dialect.name]
-    made = Database(backends.blank(other, folder))
-    keep_erasures(database, folder / "list.json")
-    how = [read_erasures(str(folder / "list.json"))] if listed else []
-    assert restore(made, folder / "b.zip", *how).demos_marked == (1 if listed else 0)
-    return made
-
-
-def test_a_mark_made_after_the_backup_is_made_again(database: Database, tmp_path: Path):
+def test_a_mark_made_after_the_backup_is_made_again(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
     demo, other = add(database), add(database, 1.0)
     mark(database, other, "recovery", "Dr Doe slipped.")
     version = cases.train(database, demos=[demo.sha256], release=True)
     back_up(database, tmp_path / "b.zip")
     mark(database, demo, "failure", "Dr Doe slipped again.")
-    after = restored(database, tmp_path)
-    try:
-        assert served(after) == []
-        with after.reading() as session:
-            outcomes = {one.sha256: one.outcome for one in session.scalars(select(Demonstration))}
-        assert outcomes == {demo.sha256: "failure", other.sha256: "recovery"}
-        with pytest.raises(Conflict, match="was marked failure"):
-            release_again(after, version)
-        assert wrong(after) == []
-        assert "Doe" not in (tmp_path / "list.json").read_text()
-    finally:
-        after.close()
-        backends.drop(after.url)
+    keep_erasures(database, tmp_path / "list.json")
+    after = empty(backends.OTHER[database.engine.dialect.name])
+    assert restore(after, tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json"))).demos_marked == 1
+    assert served(after) == []
+    with after.reading() as session:
+        outcomes = {one.sha256: one.outcome for one in session.scalars(select(Demonstration))}
+    assert outcomes == {demo.sha256: "failure", other.sha256: "recovery"}
+    with pytest.raises(Conflict, match="was marked failure"):
+        release_again(after, version)
+    assert wrong(after) == []
+    assert "Doe" not in (tmp_path / "list.json").read_text()
 
 
-def test_a_mark_taken_back_before_the_list_is_not_made_again(database: Database, tmp_path: Path):
+def test_a_mark_taken_back_before_the_list_is_not_made_again(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
     demo = add(database)
     cases.train(database, release=True)
     back_up(database, tmp_path / "b.zip")
@@ -408,9 +393,8 @@ def test_a_mark_taken_back_before_the_list_is_not_made_again(database: Database,
     keep_erasures(database, tmp_path / "list.json")
     listed = read_erasures(str(tmp_path / "list.json"))
     assert [outcome for _, outcome in listed.outcomes.values()] == ["success"]
-    after = Database(backends.blank("sqlite", tmp_path))
+    after = empty("sqlite")
     assert restore(after, tmp_path / "b.zip", listed).demos_marked == 0
     with after.reading() as session:
         assert session.scalars(select(Demonstration)).one().outcome is None
     assert served(after) == []  # the mark withdrew it, and the list never releases
-    after.close()

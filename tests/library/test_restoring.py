@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import timedelta
 from functools import partialmethod
 from pathlib import Path
@@ -37,20 +37,16 @@ BOTH = {"uses": ["training", "export"], "until": None}
 
 
 @pytest.fixture
-def restored(database: Database, tmp_path: Path) -> Iterator[Callable[[], Database]]:
+def restored(database: Database, empty: Callable[[str], Database], tmp_path: Path) -> Callable[[], Database]:
     """Restore `b.zip` with the list of endings in `database` since, into a database of the other back end."""
-    made: list[Database] = []
 
     def make() -> Database:
-        made.append(Database(backends.blank(backends.OTHER[database.engine.dialect.name], tmp_path)))
+        made = empty(backends.OTHER[database.engine.dialect.name])
         keep_erasures(database, tmp_path / "list.json")
-        restore(made[-1], tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json")))
-        return made[-1]
+        restore(made, tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json")))
+        return made
 
-    yield make
-    for one in made:
-        one.close()
-        backends.drop(one.url)
+    return make
 
 
 def served(database: Database) -> str | None:

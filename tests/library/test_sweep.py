@@ -1,6 +1,6 @@
 """Uploads in pieces, erasures in steps, retentions, and batches whose styles are added in steps."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any
@@ -15,7 +15,7 @@ from skills.db.session import Database
 from skills.errors import Busy, NotFound
 from skills.formats.parsed import parse_recording
 from skills.library.operation import sweep
-from skills.library.operation.jobs import find_job, identity_of, list_jobs
+from skills.library.operation.jobs import cancel, find_job, identity_of, list_jobs
 from skills.library.operation.sweep import STEADY_S, SteadyClock, drop_contents, sweep_erased
 from skills.library.people.erasure import delete_recording, erase_surgeon
 from skills.library.plans.plans import planned, trajectory_of
@@ -262,23 +262,31 @@ def test_old_pictures_are_deleted_with_the_jobs_that_drew_them(database: Databas
     assert counted(database, models.StoredPlayback) == 5
 
 
-def test_a_batch_does_not_end_before_all_its_styles_are_added(database: Database, monkeypatch: pytest.MonkeyPatch):
+def batch_of_two(database: Database, monkeypatch: pytest.MonkeyPatch, then: Callable[[Session, Job], None]) -> Job:
+    """Ask for a batch of two styles, which are added one by one; a callback runs after each."""
     monkeypatch.setattr(retraining, "STYLES_AT_ONCE", 1)
     cases.add_surgeon(database, "osprey")
     for slug in ("kestrel", "osprey"):
         cases.add_demo(database, surgeon=slug)
     divide = retraining._divide
 
-    def and_work(session: Session, job: Job, *styles: Any) -> None:
+    def and_then(session: Session, job: Job, *styles: Any) -> None:
         divide(session, job, *styles)
+        then(session, job)
+
+    monkeypatch.setattr(retraining, "_divide", and_then)
+    return ask_retraining(database)
+
+
+def test_a_batch_does_not_end_before_all_its_styles_are_added(database: Database, monkeypatch: pytest.MonkeyPatch):
+    def work(session: Session, job: Job) -> None:
         session.commit()
         for part in parts_of(database, job):
             if part.state == "queued":
                 cases.work(database, part)
         assert look(database, job).state == "running"
 
-    monkeypatch.setattr(retraining, "_divide", and_work)
-    assert ask_retraining(database).state == "succeeded"
+    assert batch_of_two(database, monkeypatch, work).state == "succeeded"
 
 
 def test_a_batch_whose_request_was_interrupted_fails_and_can_be_repeated(
@@ -302,20 +310,7 @@ def test_a_batch_whose_request_was_interrupted_fails_and_can_be_repeated(
 
 
 def test_a_batch_cancelled_while_styles_are_added_gets_no_more(database: Database, monkeypatch: pytest.MonkeyPatch):
-    from skills.library.operation.jobs import cancel
-
-    monkeypatch.setattr(retraining, "STYLES_AT_ONCE", 1)
-    cases.add_surgeon(database, "osprey")
-    for slug in ("kestrel", "osprey"):
-        cases.add_demo(database, surgeon=slug)
-    divide = retraining._divide
-
-    def and_cancel(session: Session, job: Job, *styles: Any) -> None:
-        divide(session, job, *styles)
-        cancel(session, job.id, "test")
-
-    monkeypatch.setattr(retraining, "_divide", and_cancel)
-    job = ask_retraining(database)
+    job = batch_of_two(database, monkeypatch, lambda session, job: cancel(session, job.id, "test"))
     assert (job.state, counted(database, StyleToRetrain)) == ("cancelled", 1)
 
 
