@@ -113,11 +113,6 @@ def as_json(value: Any) -> Any:
     return _with_lists(_adapter(value.__class__).dump_python(value))
 
 
-def plain_json(value: Any) -> Any:
-    """Return a schema's value as plain JSON, for encoders that do not know it: times as text, too."""
-    return _adapter(value.__class__).dump_python(value, mode="json")
-
-
 def _with_lists(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _with_lists(part) for name, part in value.items()}

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from copy import deepcopy
 from importlib.util import find_spec
@@ -246,32 +246,48 @@ def pytest_unconfigure(config: pytest.Config) -> None:
         reporter.write_line(f"{count} NOT TESTED - {reason}", yellow=True, bold=True)
 
 
-@pytest.fixture
-def with_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., tuple[int, str]]]:
-    """Yield a function that runs a command on a separate database and returns its exit code and its output."""
-    from typer.testing import CliRunner
+class Commands:
+    """The command line in this process: a call returns the exit code and the output of a command."""
 
-    from skills.cli import app
+    def __call__(self, *words: str) -> tuple[int, str]:
+        from typer.testing import CliRunner
+
+        from skills.cli import app
+
+        result = CliRunner().invoke(app, list(words))
+        return result.exit_code, result.output
+
+    def does(self, *words: str, says: str = "", code: int = 0) -> str:
+        """Run a command that succeeds and says so, and return its output."""
+        found, said = self(*words)
+        assert (found, says in said) == (code, True), said
+        return said
+
+    def json(self, *words: str) -> Any:
+        """Run a command that succeeds, and return its document."""
+        return json.loads(self.does(*words, "--json"))
+
+    def refuses(self, *words: str, says: str) -> str:
+        """Run a command that is refused with these words, and return its output."""
+        return self.does(*words, says=says, code=1)
+
+
+@pytest.fixture
+def with_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Commands]:
+    """Yield the command line on a separate database."""
     from tests import backends
 
     monkeypatch.setenv("SKILLS_DATABASE_URL", backends.place(tmp_path / "skills.sqlite"))
     monkeypatch.setenv("SKILLS_WORKERS", "1")  # tests/jobs has several
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
     settings.cache_clear()
-
-    def run(*words: str) -> tuple[int, str]:
-        result = CliRunner().invoke(app, list(words))
-        return result.exit_code, result.output
-
-    yield run
+    yield Commands()
     settings.cache_clear()
 
 
 @pytest.fixture
-def skills(
-    with_worker: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., tuple[int, str]]:
-    """Return the function of `with_worker`, of commands that start no worker."""
+def skills(with_worker: Commands, monkeypatch: pytest.MonkeyPatch) -> Commands:
+    """Return the command line of `with_worker`, whose commands start no worker."""
     from tests.library import cases
 
     monkeypatch.setattr("skills.serving.working", cases.working)

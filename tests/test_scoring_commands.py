@@ -19,10 +19,8 @@ def test_a_file_is_scored_by_its_proposed_hand_off(skills: Run, tmp_path: Path) 
     file, many = tmp_path / "plover.mcap", tmp_path / "many.mcap"
     file.write_bytes(sample.data)
     many.write_bytes(several.data)
-    assert skills("seed")[0] == 0
-    code, said = skills("score", str(file), *STYLE, "--json")
-    assert code == 0, said
-    scored = json.loads(said)
+    skills.does("seed")
+    scored = skills.json("score", str(file), *STYLE)
     assert scored["demo"] is None and scored["recording"]
     (start_s, end_s) = sample.segments[0]
     assert scored["start_s"] == pytest.approx(start_s, abs=0.3) and scored["end_s"] == pytest.approx(end_s, abs=0.6)
@@ -36,7 +34,7 @@ def test_a_file_is_scored_by_its_proposed_hand_off(skills: Run, tmp_path: Path) 
 
 @pytest.mark.parametrize("what", ["nowhere.mcap", "0" * 64])
 def test_what_is_not_there_is_said(skills: Run, what: str) -> None:
-    assert skills("seed")[0] == 0
+    skills.does("seed")
     code, said = skills("score", what, *STYLE)
     assert code == 1 and "There is no" in said, said
 
@@ -44,14 +42,12 @@ def test_what_is_not_there_is_said(skills: Run, what: str) -> None:
 @pytest.mark.nightly  # by day tests/library
 def test_a_folder_is_calibrated_on_and_used_by_the_next_score(skills: Run, tmp_path: Path) -> None:
     lab = rated.folder(tmp_path / "lab")
-    code, said = skills("calibrate", str(lab), "--permutations", "39", "--json")
-    assert code == 0, said
-    about = json.loads(said)
+    about = skills.json("calibrate", str(lab), "--permutations", "39")
     assert about["data"]["trials"] == 40 and about["validated"]["mean"]["model"]["rho"] > 0.8
-    assert skills("seed")[0] == 0
+    skills.does("seed")
     trial = sorted((lab / "Suturing/kinematics/AllGestures").iterdir())[0]
     part = ("--arm", "PSM_right", "--start-s", "1", "--end-s", "4")
-    skill = json.loads(skills("score", str(trial), *STYLE, *part, "--task", "Suturing", "--json")[1])["skill"]
+    skill = skills.json("score", str(trial), *STYLE, *part, "--task", "Suturing")["skill"]
     assert skill["calibrated"] and skill["calibration"] == about["sha256"]
     code, said = skills("calibrate", str(tmp_path / "lab" / "Suturing" / "transcriptions"))
     assert code == 1 and "has no trials of JIGSAWS" in said, said

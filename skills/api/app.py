@@ -4,7 +4,6 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from math import inf
-from typing import Any
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
@@ -19,7 +18,7 @@ from skills.api.encoded_policies import Encoded
 from skills.api.gate import Gate
 from skills.api.job_events import Watching
 from skills.api.metrics import Observed, ServiceMetrics
-from skills.api.openapi import complete
+from skills.api.openapi import Json, complete
 from skills.api.policy_cache import CachedPolicyMiddleware, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.routes import (
@@ -162,7 +161,7 @@ def prepare_to_serve(database: Database, settings: Settings) -> None:
 class Service(FastAPI):
     """FastAPI with `Gate`, `Headers` and `Observed` around all responses, including its own 413 and 500 responses."""
 
-    def openapi(self) -> dict[str, Any]:
+    def openapi(self) -> Json:
         """Return the OpenAPI document, built at the first call and cached."""
         if self.openapi_schema is None:
             self.openapi_schema = complete(super().openapi())

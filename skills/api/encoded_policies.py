@@ -1,6 +1,6 @@
 """Encoded responses of policies, cached under the digest of the policy and the identity of its release."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 from skills.api.responses import JSON, Body, json_of, negotiate, tag_of
 from skills.db.history import History
@@ -31,21 +31,12 @@ class Encoded:
         released = (release.row, release.released_at) if release else None
         poses = policy.poses.sha256 if policy.poses else None
         key = (policy.sha256, policy.version, policy.created_at, released, poses, media_type)
-        body = self._kept.get(key)
-        if body is None:
-            body = _encode(policy, release, media_type)
-            self._kept.put(key, body)
-        return body
+        return self._cached(key, lambda: _encode(policy, release, media_type))
 
     def pose_style(self, policy: PolicyVersion) -> Body:
         """Return the encoded pose style of a policy version, from the cache if it is there."""
         key = (policy.sha256, policy.version, policy.created_at, policy.poses.sha256 if policy.poses else None)
-        body = self._kept.get(key)
-        if body is None:
-            content = json_of(describe_pose_style(policy, poses_of(policy)))
-            body = Body(content, JSON, tag_of(content))
-            self._kept.put(key, body)
-        return body
+        return self._cached(key, lambda: _json_body(json_of(describe_pose_style(policy, poses_of(policy)))))
 
     def signature(self, served: Served, head: Note, history: History) -> Body:
         """Return the signature of the responses of a released policy, each as it is sent; they are encoded for it.
@@ -65,8 +56,14 @@ class Encoded:
             bodies["pose-style.json"] = self.pose_style(policy)
         digests = {name: body.etag.strip('"') for name, body in bodies.items()}
         facts = {"surgeon": policy.surgeon.slug, "suture": policy.suture, "version": policy.version}
-        content = sign_files(history, head, digests, kind="policy", policy=policy.sha256, **facts)
-        return Body(content, JSON, tag_of(content))
+        return _json_body(sign_files(history, head, digests, kind="policy", policy=policy.sha256, **facts))
+
+    def _cached(self, key: tuple[object, ...], encode: Callable[[], Body]) -> Body:
+        body = self._kept.get(key)
+        if body is None:
+            body = encode()
+            self._kept.put(key, body)
+        return body
 
     def policies(self) -> set[str]:
         """Return the digests of the policies with cached responses."""
@@ -75,6 +72,10 @@ class Encoded:
     def forget(self, policies: Collection[str]) -> None:
         """Remove the cached responses of these policies."""
         self._kept.forget([key for key, _ in self._kept.items() if key[0] in policies])
+
+
+def _json_body(content: bytes) -> Body:
+    return Body(content, JSON, tag_of(content))
 
 
 def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> Body:

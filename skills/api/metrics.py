@@ -9,6 +9,7 @@ import platform
 import re
 from collections.abc import Iterator
 from contextlib import suppress
+from datetime import datetime
 from random import Random
 from threading import Lock, Thread
 from time import perf_counter
@@ -60,10 +61,8 @@ class ServiceMetrics:
         gauge.set_function(lambda: self._in_progress)
         self.sessions = Gauge("skills_sessions_open", "Sessions of pose styles.", registry=self._registry)
         self._known: dict[tuple[str, str, int], Histogram] = {}
-        about = {"version": __version__, "schema": revisions()[0], "python": platform.python_version()}
-        Info("skills_build", "Version, database schema and Python of this process.", registry=self._registry).info(
-            about
-        )
+        build = Info("skills_build", "Version, database schema and Python of this process.", registry=self._registry)
+        build.info({"version": __version__, "schema": revisions()[0], "python": platform.python_version()})
         ProcessCollector(registry=self._registry)
         self._registry.register(Installation(database, lease_s))
 
@@ -152,25 +151,17 @@ def _figures(found: Condition) -> Iterator[Metric]:
         for quantile, seconds in quantiles.items():
             took.add_metric((kind, str(quantile)), seconds)
     yield took
-    verified_at, last_event_at = found.verified_at, found.last_event_at
     for name, meaning, value in (
         ("oldest_queued_seconds", "Waiting time of the oldest queued job.", found.oldest_queued_s),
         ("workers", "Workers that renewed their lease in time.", found.workers),
         ("database_bytes", "Size of the database.", found.database_bytes),
         ("history_faults", "Faults that the last verification found.", found.faults_found),
-        (
-            "history_verified_timestamp_seconds",
-            "Time at which a worker last verified the history.",
-            None if verified_at is None else verified_at.timestamp(),
-        ),
-        (
-            "last_event_timestamp_seconds",
-            "Time at which the last event was written.",
-            None if last_event_at is None else last_event_at.timestamp(),
-        ),
+        ("history_verified_timestamp_seconds", "Time of the last verification of the history.", found.verified_at),
+        ("last_event_timestamp_seconds", "Time at which the last event was written.", found.last_event_at),
     ):
         if value is not None:
-            yield GaugeMetricFamily(f"skills_{name}", meaning, value)
+            number = value.timestamp() if isinstance(value, datetime) else value
+            yield GaugeMetricFamily(f"skills_{name}", meaning, number)
 
 
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"})

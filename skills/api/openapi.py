@@ -72,6 +72,7 @@ class Declared(TypedDict, total=False):
 
 def router_of(tag: str, **options: Any) -> APIRouter:
     """Return a router with strict JSON of at most a mebibyte; the ids of its operations are the functions' names."""
+    # a limit for each router, because that of the application is the largest upload
     options = {"route_class": Strict, "max_body_size": MEBIBYTE, **options}
     return APIRouter(generate_unique_id_function=lambda route: route.name, tags=[tag], **options)
 

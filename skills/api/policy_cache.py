@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skills.api.authorisation import Needs
 from skills.api.encoded_policies import FORMATS, KEPT_BYTES, Encoded
-from skills.api.responses import Body, answer, negotiate
+from skills.api.responses import Body, Conditions, negotiate
 from skills.db.changes import Unasked, changes_of
 from skills.db.session import Database
 from skills.db.weighted_cache import WeightedCache
@@ -212,7 +212,7 @@ class CachedPolicyMiddleware:
             return None
         # read by the authorisation and by the metrics
         scope["route"], scope["path_params"] = self._route, found.groupdict()
-        return answer(body, if_none_match)
+        return Conditions(None, if_none_match).answer(body)
 
     async def _may(self, scope: Scope) -> bool:
         try:

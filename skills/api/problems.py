@@ -17,6 +17,7 @@ import orjson
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel
+from pydantic_core import ErrorDetails
 from starlette.exceptions import HTTPException
 
 from skills import errors
@@ -61,8 +62,9 @@ TITLES = {404: "Not found", 405: "This call does not exist here", 413: "Too larg
 def problem(
     status: int, kind: str, title: str, detail: str, *, headers: dict[str, str] | None = None, **more: Any
 ) -> Response:
-    """Return a problem document as a response."""
-    body = {"type": f"urn:suture-skills:{kind}", "title": title, "status": status, "detail": detail, **more}
+    """Return a problem document as a response, with the further fields that are not empty."""
+    body = {"type": f"urn:suture-skills:{kind}", "title": title, "status": status, "detail": detail}
+    body |= {name: value for name, value in more.items() if value}
     return Response(orjson.dumps(body, default=str), status, headers=headers, media_type="application/problem+json")
 
 
@@ -114,7 +116,7 @@ LIMITS = {
 TOO_LARGE = problem(413, "http-413", TITLES[413], DETAILS[413])  # replaces Starlette's plain-text response
 
 
-def _where(one: dict[str, Any]) -> str:
+def _where(one: ErrorDetails) -> str:
     """Return the path of a refused field; the name of an unknown field is omitted, as text that the client sent."""
     known = one["loc"][:-1] if one["type"] == "extra_forbidden" else one["loc"]
     return ".".join(str(part) for part in known)[:200]
@@ -142,7 +144,7 @@ def _names(kind: Any, path: Sequence[str | int]) -> list[str]:
     return next((found for part in parts if (found := _names(part, path))), [])
 
 
-def _why(one: dict[str, Any], body: Any = None) -> str:
+def _why(one: ErrorDetails, body: Any = None) -> str:
     """Return why a field is refused, as a phrase that follows its name: the limit in words, and the given number.
 
     Text that was sent is not repeated: the client, which has it, adds it to the message.
@@ -203,10 +205,8 @@ def answer_to(error: errors.SkillsError) -> Response:
             headers = HEADERS.get(family)
             if isinstance(error, errors.TooMany):
                 headers = {"Retry-After": str(max(1, math.ceil(error.wait_s)))}
-            more: dict[str, Any] = {"numbers": error.numbers} if error.numbers else {}
-            more["reason"] = error.message
-            if error.remedies:
-                more["remedies"] = [one if isinstance(one, str) else one.as_json() for one in error.remedies]
+            remedies = [one if isinstance(one, str) else one.as_json() for one in error.remedies]
+            more = {"numbers": error.numbers, "reason": error.message, "remedies": remedies}
             return problem(status, error.kind, title, error.words(Door.HTTP), headers=headers, **more)
     raise error
 

@@ -29,7 +29,7 @@ Condition = Annotated[str | None, Header(max_length=2000)]
 T = TypeVar("T")
 
 
-@lru_cache(256)
+@lru_cache(256)  # the same few headers come with every request, and a policy is served in microseconds
 def negotiate(accept: str, resource: str, *offered: str) -> str:
     """Return the media type with the highest weight, and of equal weights the first that the client names.
 
@@ -67,7 +67,7 @@ def json_of(said: Any, *, indented: bool = False) -> bytes:
     return orjson.dumps(said, default=_fields, option=orjson.OPT_UTC_Z | indent)
 
 
-def _fields(said: Any) -> dict[str, Any]:
+def _fields(said: Any) -> dict[str, object]:
     if isinstance(said, BaseModel):
         return said.model_dump(mode="json", warnings=False)  # lists of arrays stand in place of tuples
     raise TypeError(f"{type(said)} is no JSON")
@@ -76,28 +76,6 @@ def _fields(said: Any) -> dict[str, Any]:
 def names(header: str, tag: str) -> bool:
     """Return whether a list of ETags, or `*`, contains a tag; weak tags match, since a proxy may weaken ours."""
     return any(one.strip().removeprefix("W/") in (tag, "*") for one in header.split(","))
-
-
-def refuse_changed(said: Any, if_match: str | None, if_none_match: str | None = None) -> None:
-    """Check the conditions of a request that changes a resource.
-
-    Args:
-        said: The current JSON of the resource, as a GET returns it; None if it does not exist.
-        if_match: Header of which one ETag must match.
-        if_none_match: Header of which no ETag may match; `*` means that the resource must not exist.
-
-    Raises:
-        PreconditionFailed: A condition does not hold.
-    """
-    tag = None if said is None else tag_of(json_of(said))
-    if if_match is not None and (tag is None or not names(if_match, tag)):
-        raise PreconditionFailed(
-            "The object no longer has the ETag in If-Match; read it again, then repeat the request."
-        )
-    if if_none_match is not None and tag is not None and names(if_none_match, tag):
-        raise PreconditionFailed(
-            "An object that matches If-None-Match exists already; read it, then repeat the request."
-        )
 
 
 RawHeaders = list[tuple[bytes, bytes]]
@@ -133,19 +111,6 @@ class EncodedResponse(Response):
         self.raw_headers = headers.copy()  # middleware adds further headers to this list
         self.body = content
         self.background = None
-
-
-def answer(body: Body, if_none_match: str | None, if_match: str | None = None) -> EncodedResponse:
-    """Return a response with a body, or 304 if the client has exactly these bytes.
-
-    Raises:
-        PreconditionFailed: If-Match names other bytes than these.
-    """
-    if if_match is not None and not {body.etag, "*"} & {tag.strip() for tag in if_match.split(",")}:
-        raise PreconditionFailed("The object no longer has the ETag in If-Match; request it without If-Match.")
-    if if_none_match is not None and (if_none_match == body.etag or names(if_none_match, body.etag)):
-        return EncodedResponse(304, body.validators, b"")
-    return EncodedResponse(200, body.headers, body.content)
 
 
 class Give:
@@ -206,26 +171,61 @@ class Listing(Generic[T]):
 
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions of a request on the ETag of its resource."""
+    """The conditions of a request on the ETag of its resource.
 
-    if_match: str | None
-    if_none_match: str | None
+    Attributes:
+        if_match: Header of which one ETag must match; None: without.
+        if_none_match: Header of which no ETag may match; `*` means that the resource must not exist.
+    """
+
+    if_match: str | None = None
+    if_none_match: str | None = None
 
     def answer(self, body: Body) -> EncodedResponse:
-        """Return a response with a body, as `answer` does."""
-        return answer(body, self.if_none_match, self.if_match)
+        """Return a response with a body, or 304 if the client has exactly these bytes.
+
+        Raises:
+            PreconditionFailed: If-Match names other bytes than these.
+        """
+        has = self.if_none_match
+        if self.if_match is not None and not {body.etag, "*"} & {tag.strip() for tag in self.if_match.split(",")}:
+            raise PreconditionFailed("The object no longer has the ETag in If-Match; request it without If-Match.")
+        if has is not None and (has == body.etag or names(has, body.etag)):  # most name one ETag
+            return EncodedResponse(304, body.validators, b"")
+        return EncodedResponse(200, body.headers, body.content)
 
     def refuse_changed(self, said: Any) -> None:
-        """Check the conditions of a change, as `refuse_changed` does; an empty header is none."""
-        if self.if_match or self.if_none_match:
-            refuse_changed(said, self.if_match, self.if_none_match)
+        """Check the conditions of a change; an empty header is none.
+
+        Args:
+            said: The current JSON of the resource, as a GET returns it; None if it does not exist.
+
+        Raises:
+            PreconditionFailed: A condition does not hold.
+        """
+        if not self.if_match and not self.if_none_match:
+            return
+        tag = None if said is None else tag_of(json_of(said))
+        if self.if_match is not None and (tag is None or not names(self.if_match, tag)):
+            raise PreconditionFailed(
+                "The object no longer has the ETag in If-Match; read it again, then repeat the request."
+            )
+        if self.if_none_match is not None and tag is not None and names(self.if_none_match, tag):
+            raise PreconditionFailed(
+                "An object that matches If-None-Match exists already; read it, then repeat the request."
+            )
 
 
 async def _conditions(if_match: Condition = None, if_none_match: Condition = None) -> Conditions:
     return Conditions(if_match, if_none_match)
 
 
+async def _if_match(if_match: Condition = None) -> Conditions:
+    return Conditions(if_match)
+
+
 Conditional = Annotated[Conditions, Depends(_conditions)]
+IfMatch = Annotated[Conditions, Depends(_if_match)]
 
 
 def as_asked(accept: str, kind: str) -> str:

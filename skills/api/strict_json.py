@@ -44,7 +44,7 @@ def strictly_read(text: str | bytes) -> Any:
     return json.loads(text, object_pairs_hook=_once, parse_constant=_refuse)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     made = dict(pairs)
     if len(made) < len(pairs):
         raise json.JSONDecodeError("An object has the same name twice", "", 0)

@@ -5,6 +5,9 @@
         with service() as client:
             return table(client.demos(surgeon), ("id", "surgeon"))
 
+The section Args of the docstring has the help of the command's own parameters. One without a default is an argument,
+any other an option, unless its annotation says otherwise.
+
 A parameter whose type is one of `skills.keywords` stands for a flag for each of its fields that is a number, a
 text or a choice, or a list of them, unless the command has a parameter of the field's name. Its value has the fields
 that were given. The service checks them, so a limit is declared once.
@@ -15,7 +18,8 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from copy import copy
 from functools import partial, wraps
 from pathlib import Path
 from types import NoneType, UnionType
@@ -77,6 +81,7 @@ OPTIONS = {
     "psm_m.approach": "approach",
     "learner.": "setting",
 }
+ARGUMENT = re.compile(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)  # of the section Args of a docstring
 PARTS = re.compile(r"(?<=[.!?]) (?=[A-Z`'])|; |\n")  # separates the fault from the remedy
 
 
@@ -95,15 +100,18 @@ def command(
 
     def register(function: Callable[..., Answer | None]) -> Callable[..., None]:
         signature = inspect.signature(function, eval_str=True)
-        parameters, flags = list(signature.parameters.values()), {}
+        text, _, described = inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")
+        helps = {name: " ".join(words.split()) for name, words in ARGUMENT.findall(described)}
+        parameters, flags = [_with_help(one, helps) for one in signature.parameters.values()], {}
         answers = signature.return_annotation is Answer
         asks_json = "as_json" in signature.parameters
         if answers and not asks_json:
-            parameters.append(_json_parameter())
+            keyword = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(inspect.Parameter("as_json", keyword, default=False, annotation=AsJson))
         for one in signature.parameters.values():
             if is_typeddict(one.annotation):
                 flags[one.name] = [*_flags(one.annotation, {*signature.parameters, *without})]
-                place = parameters.index(one)
+                place = [parameter.name for parameter in parameters].index(one.name)
                 parameters[place : place + 1] = [flag for flag, _ in flags[one.name]]
 
         @wraps(function)
@@ -130,14 +138,27 @@ def command(
             [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
         )
         run.__annotations__ = {one.name: one.annotation for one in parameters}
-        group.command(name)(run)
+        group.command(name, help=text)(run)
         return run
 
     return register
 
 
-def _json_parameter() -> inspect.Parameter:
-    return inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
+def _with_help(parameter: inspect.Parameter, helps: Mapping[str, str]) -> inspect.Parameter:
+    """Return a parameter of a command with its help, where the docstring has it."""
+    if parameter.name not in helps:
+        return parameter
+    kind: Any = parameter.annotation
+    info: Any
+    if get_origin(kind) is Annotated:
+        kind, info = get_args(kind)
+    elif parameter.default is parameter.empty:
+        info = typer.Argument()
+    else:  # a switch alone, where Typer would add its negation
+        info = typer.Option(*[f"--{parameter.name.replace('_', '-')}"] * (kind is bool))
+    info = copy(info)  # several commands may share it
+    info.help = helps[parameter.name]
+    return parameter.replace(annotation=Annotated[kind, info])
 
 
 def _print(answer: Answer, as_json: bool) -> None:
@@ -373,7 +394,7 @@ def about_path(error: OSError) -> list[str]:
     return []
 
 
-def _problem(error: SkillsError, detail: str) -> dict[str, Any]:
+def _problem(error: SkillsError, detail: str) -> dict[str, object]:
     """Return the problem document (RFC 9457) of an error: the service's own, or one for an error of this command."""
     from skills.client import Problem
 

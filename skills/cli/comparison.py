@@ -10,7 +10,7 @@ import typer
 from skills.cli.commands import Surgeon, Suture, TheSurgeon, TheSuture, command
 from skills.cli.completion import complete_surgeons
 from skills.cli.connecting import service
-from skills.cli.output import Answer, out, say, show_table, table, text
+from skills.cli.output import Answer, say, show_cells, show_table, table, text
 from skills.cli.uploading import ready
 from skills.errors import BadInput
 from skills.keywords import ScoreKeywords
@@ -28,15 +28,14 @@ commands = typer.Typer()
 
 
 @command(commands)
-def atlas(
-    suture: Suture,
-    scaled: Annotated[bool, typer.Option("--scaled", help="Scale all demonstrations to one size.")] = False,
-    clusters: Annotated[int | None, typer.Option(help="Number of clusters; by default as many as are found.")] = None,
-    demo: Annotated[
-        str | None, typer.Option(help="Recognise the surgeon of this demonstration, by its digest.")
-    ] = None,
-) -> Answer:
-    """Compare all demonstrations of a suture type: clusters, differences between surgeons, and recognition."""
+def atlas(suture: Suture, scaled: bool = False, clusters: int | None = None, demo: str | None = None) -> Answer:
+    """Compare all demonstrations of a suture type: clusters, differences between surgeons, and recognition.
+
+    Args:
+        scaled: Scale all demonstrations to one size.
+        clusters: Number of clusters; by default as many as are found.
+        demo: Recognise the surgeon of this demonstration, by its digest.
+    """
     with service() as client:
         found = client.atlas(suture, scaled=scaled, clusters=clusters, demo=demo)
     return Answer(found, lambda: _show_atlas(suture, found))
@@ -101,11 +100,12 @@ def _say_recognised(found: "Atlas") -> None:
 
 
 @command(commands)
-def recognise(
-    recording: Annotated[str, typer.Argument(help="The digest of a recording that has a demonstration.")],
-    suture: TheSuture,
-) -> Answer:
-    """Recognise the surgeon of a whole recording by all its movements, with its session left out."""
+def recognise(recording: str, suture: TheSuture) -> Answer:
+    """Recognise the surgeon of a whole recording by all its movements, with its session left out.
+
+    Args:
+        recording: The digest of a recording that has a demonstration.
+    """
     with service() as client:
         found = client.recognise(recording, suture)
     low, high = found.votes.interval
@@ -124,13 +124,14 @@ def _rounded(distance: float | None) -> str | None:
 
 @command(commands, without=("demo", "recording"))
 def score(
-    what: Annotated[str, typer.Argument(help="A recording's file, which is then stored; or a demonstration's digest.")],
-    surgeon: TheSurgeon,
-    suture: TheSuture,
-    options: ScoreKeywords,
-    proposal: Annotated[int | None, typer.Option(help="The proposed hand-off of a file, counted from 1.")] = None,
+    what: str, surgeon: TheSurgeon, suture: TheSuture, options: ScoreKeywords, proposal: int | None = None
 ) -> Answer:
-    """Score a motion against a style: its distance, where it deviates, and its percentiles. Not a credential."""
+    """Score a motion against a style: its distance, where it deviates, and its percentiles. Not a credential.
+
+    Args:
+        what: A recording's file, which is then stored; or a demonstration's digest.
+        proposal: The proposed hand-off of a file, counted from 1.
+    """
     with service() as client:
         if Path(what).exists():
             _choose_part(client, Path(what), proposal, options)
@@ -171,18 +172,14 @@ def _choose_part(client: "Client", path: Path, proposal: int | None, options: Sc
 
 
 def _show_score(scored: "Score") -> None:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
     beside = [one for one in scored.percentiles if one.below]
-    for name in ("", "value", "reference", "ratio", "", *(f"below {one.level}" for one in beside)):
-        table.add_column(name)
+    rows = []
     for one in scored.figures:
         below = [level.below.get(one.name) if level.below else None for level in beside]
         shares = ["" if share is None else f"{100 * share:.0f} %" for share in below]
         numbers = ["" if n is None else f"{n:.2f}" for n in (one.value, one.reference, one.ratio)]
-        table.add_row(one.label, *numbers, one.unit, *shares)
-    out.print(table)
+        rows.append((one.label, *numbers, one.unit, *shares))
+    show_cells(("", "value", "reference", "ratio", "", *(f"below {one.level}" for one in beside)), rows)
     say(f"Beside {scored.reference.demo}: {scored.reference.because}.")
     named = scored.differences.words if scored.differences else ()
     say(*named, *scored.deviation.words, *scored.skill.words, scored.use)
@@ -190,13 +187,13 @@ def _show_score(scored: "Score") -> None:
 
 @command(commands)
 def progress(
-    surgeon: Surgeon,
-    suture: TheSuture,
-    against: Annotated[
-        str, typer.Option(help="The surgeon whose style is the reference.", autocompletion=complete_surgeons)
-    ],
+    surgeon: Surgeon, suture: TheSuture, against: Annotated[str, typer.Option(autocompletion=complete_surgeons)]
 ) -> Answer:
-    """Compare a surgeon's demonstrations with a style's reference, session by session. Not a credential."""
+    """Compare a surgeon's demonstrations with a style's reference, session by session. Not a credential.
+
+    Args:
+        against: The surgeon whose style is the reference.
+    """
     with service() as client:
         found = client.progress(surgeon, suture, against=against)
     rows = [

@@ -7,14 +7,15 @@ import atexit
 import os
 import sys
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+from skills.cli.connecting import installation
 
 if TYPE_CHECKING:
     from skills.client import Client
-    from skills.db.session import Database
 
 LIMIT_S = 1.5  # timeout of completion, ours: longer than a warm response takes, shorter than a user waits
 MOST = 200
@@ -22,12 +23,12 @@ MOST = 200
 
 def complete_surgeons(incomplete: str) -> list[str]:
     """Return the surgeons that complete an input."""
-    return _in_time(_surgeons, incomplete)
+    return _in_time(lambda: _found(lambda client: [one.surgeon for one in client.surgeons()], "surgeons"), incomplete)
 
 
 def complete_sutures(incomplete: str) -> list[str]:
     """Return the suture types that complete an input."""
-    return _in_time(_sutures, incomplete)
+    return _in_time(lambda: _found(lambda client: [one.suture for one in client.suture_types()], "sutures"), incomplete)
 
 
 def _in_time(find: Callable[[], list[str]], incomplete: str) -> list[str]:
@@ -52,27 +53,7 @@ def _end_without(thread: Thread) -> None:
         os._exit(0)
 
 
-def _surgeons() -> list[str]:
-    def stored(database: "Database") -> list[str]:
-        from skills.library.people.surgeons import list_surgeons
-
-        with database.reading() as session:
-            return [row.slug for row in list_surgeons(session, MOST, None)]
-
-    return _found(lambda client: [one.surgeon for one in client.surgeons()], stored)
-
-
-def _sutures() -> list[str]:
-    def stored(database: "Database") -> list[str]:
-        from skills.library.people.suture_types import list_suture_types
-
-        with database.reading() as session:
-            return [row.slug for row in list_suture_types(session, MOST, None)]
-
-    return _found(lambda client: [one.suture for one in client.suture_types()], stored)
-
-
-def _found(served: "Callable[[Client], list[str]]", stored: "Callable[[Database], list[str]]") -> list[str]:
+def _found(served: "Callable[[Client], list[str]]", of: Literal["surgeons", "sutures"]) -> list[str]:
     """Return names from the service, if one is configured, else from the database, if it exists."""
     from skills.settings import settings
 
@@ -85,7 +66,10 @@ def _found(served: "Callable[[Client], list[str]]", stored: "Callable[[Database]
     file = url.removeprefix("sqlite:///")
     if file != url and not Path(file).is_file():
         return []
-    from skills.db.session import Database
+    from skills.library.people.surgeons import list_surgeons
+    from skills.library.people.suture_types import list_suture_types
 
-    with closing(Database(url, patience_ms=int(LIMIT_S * 1000))) as database:
-        return stored(database)
+    with installation(patience_ms=int(LIMIT_S * 1000)) as database, database.reading() as session:
+        if of == "surgeons":
+            return [row.slug for row in list_surgeons(session, MOST, None)]
+        return [row.slug for row in list_suture_types(session, MOST, None)]

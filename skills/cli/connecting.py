@@ -1,13 +1,14 @@
 """The connection of a command to the service, or to the application in its own process, and waiting for jobs there."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from skills.cli.output import job_status
 
 if TYPE_CHECKING:
     from skills.client import Client
+    from skills.db.session import Database
     from skills.schemas.operation import Job
     from skills.settings import Settings
 
@@ -55,6 +56,16 @@ def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
         finally:
             if settings.erasures_file is not None:
                 keep_up_erasures(app.state.database, settings.erasures_file)
+
+
+@contextmanager
+def installation(*, patience_ms: int | None = None) -> Iterator["Database"]:
+    """Open the database of this installation."""
+    from skills.db.session import Database
+    from skills.settings import settings
+
+    with closing(Database(settings().database_url, patience_ms=patience_ms)) as database:
+        yield database
 
 
 def finished(client: "Client", job: "Job", timeout_s: float = WAIT_S) -> "Job":

@@ -23,29 +23,23 @@ commands = typer.Typer()
 
 @command(commands, "export-dataset")
 def export_dataset(
-    to: Annotated[Path, typer.Argument(metavar="OUT", help="A new folder, or a new file that ends in .zip.")],
+    to: Annotated[Path, typer.Argument(metavar="OUT")],
     options: DatasetKeywords,
-    videos: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Add the videos of this LeRobot dataset of yours, from which the recordings were uploaded; "
-            "repeatable, with --whole. They stay on this machine."
-        ),
-    ] = None,
-    pictures_consented: Annotated[
-        bool,
-        typer.Option(
-            "--pictures-consented",
-            help="Declare that everyone in the videos consented to passing them on: the service knows no such consent.",
-        ),
-    ] = False,
-    column: Annotated[
-        list[str] | None,
-        typer.Option(help="A column under another name in a LeRobot dataset, as in the upload; repeatable."),
-    ] = None,
+    videos: list[Path] | None = None,
+    pictures_consented: bool = False,
+    column: list[str] | None = None,
     tool: Tool = None,
 ) -> Answer:
-    """Export demonstrations as a LeRobot dataset, and verify it; the consent to export is required."""
+    """Export demonstrations as a LeRobot dataset, and verify it; the consent to export is required.
+
+    Args:
+        to: A new folder, or a new file that ends in .zip.
+        videos: Add the videos of this LeRobot dataset of yours, from which the recordings were uploaded; repeatable,
+            with --whole. They stay on this machine.
+        pictures_consented: Declare that everyone in the videos consented to passing them on: the service knows no such
+            consent.
+        column: A column under another name in a LeRobot dataset, as in the upload; repeatable.
+    """
     from skills.formats.lerobot.manifest import refuse_existing
     from skills.schemas.results import DatasetResult
 

@@ -29,12 +29,16 @@ def demo_add(
     path: RecordingPath,
     cut: DemoKeywords,
     table: TableKeywords,
-    proposal: Annotated[int | None, typer.Option(help="The same as --segment with a number.")] = None,
+    proposal: int | None = None,
     episode: OneEpisode = None,
     tool: Tool = None,
     as_json: AsJson = False,
 ) -> Answer:
-    """Store a recording and one demonstration of it; if several hand-offs are proposed, name one with --segment."""
+    """Store a recording and one demonstration of it; if several hand-offs are proposed, name one with --segment.
+
+    Args:
+        proposal: The same as --segment with a number.
+    """
     from skills.client import Problem
 
     if proposal is not None:
@@ -78,11 +82,13 @@ def measured(demo: "Demonstration", *sentences: str) -> Answer:
 def demo_list(
     surgeon: OfSurgeon = None,
     suture: OfSuture = None,
-    outcome: Annotated[
-        Literal["success", "recovery", "failure", "unknown"] | None, typer.Option(help="Only those marked so.")
-    ] = None,
+    outcome: Literal["success", "recovery", "failure", "unknown"] | None = None,
 ) -> Answer:
-    """List demonstrations, the newest first."""
+    """List demonstrations, the newest first.
+
+    Args:
+        outcome: Only those marked so.
+    """
     with service() as client:
         return table(client.demos(surgeon, suture, outcome=outcome), COLUMNS)
 
@@ -97,11 +103,12 @@ def demo_show(demo: Demo) -> Answer:
 
 
 @command(demos, "report")
-def demo_report(
-    demo: Demo,
-    html: Annotated[Path | None, typer.Option(help="Write the report to this file as HTML.")] = None,
-) -> Answer:
-    """Report the quality of a demonstration, and how to improve it."""
+def demo_report(demo: Demo, html: Path | None = None) -> Answer:
+    """Report the quality of a demonstration, and how to improve it.
+
+    Args:
+        html: Write the report to this file as HTML.
+    """
     with service() as client:
         if html is not None:
             html.write_bytes(client.demo_report_page(demo))
@@ -119,12 +126,13 @@ def demo_save(demo: Demo, to: ToFile) -> Answer:
 
 
 @command(demos, "mark")
-def demo_mark(
-    demo: Demo,
-    outcome: Annotated[Literal["success", "recovery", "failure"], typer.Argument(help="What became of the hand-off.")],
-    reason: Annotated[str | None, typer.Option(help="Why; needed for a recovery or a failure.")] = None,
-) -> Answer:
-    """Mark a demonstration; a recovery or a failure is not learnt from, and releases that rest on it are withdrawn."""
+def demo_mark(demo: Demo, outcome: Literal["success", "recovery", "failure"], reason: str | None = None) -> Answer:
+    """Mark a demonstration; a recovery or a failure is not learnt from, and releases that rest on it are withdrawn.
+
+    Args:
+        outcome: What became of the hand-off.
+        reason: Why; needed for a recovery or a failure.
+    """
     with service() as client:
         marked = client.mark_demo(demo, outcome, reason=reason)
     return text(marked, *_outcome(marked))
@@ -137,11 +145,12 @@ def _outcome(demo: "Demonstration") -> list[str]:
 
 
 @command(demos, "withdraw")
-def demo_withdraw(
-    demo: Demo,
-    erase: Annotated[bool, typer.Option("--erase", help="Delete it and everything derived from it.")] = False,
-) -> Answer:
-    """Withdraw a demonstration and the releases that rest on it."""
+def demo_withdraw(demo: Demo, erase: bool = False) -> Answer:
+    """Withdraw a demonstration and the releases that rest on it.
+
+    Args:
+        erase: Delete it and everything derived from it.
+    """
     with service() as client:
         client.withdraw_demo(demo, erase=erase)
     done = "erased" if erase else "withdrawn"

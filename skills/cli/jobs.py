@@ -17,13 +17,12 @@ COLUMNS = ("id", "kind", "state", "progress", "created_at", "error")
 
 
 @command(jobs, "list")
-def job_list(
-    state: Annotated[
-        Literal["queued", "running", "succeeded", "failed", "cancelled"] | None,
-        typer.Option(help="Only jobs in this state."),
-    ] = None,
-) -> Answer:
-    """List jobs, the newest first."""
+def job_list(state: Literal["queued", "running", "succeeded", "failed", "cancelled"] | None = None) -> Answer:
+    """List jobs, the newest first.
+
+    Args:
+        state: Only jobs in this state.
+    """
     with service() as client:
         return table(client.jobs(state), COLUMNS)
 
@@ -36,11 +35,12 @@ def job_show(job: JobId) -> Answer:
 
 
 @command(jobs, "wait")
-def job_wait(
-    job: JobId,
-    timeout_s: Annotated[float, typer.Option(help="Longest waiting time in seconds.")] = 600.0,
-) -> Answer:
-    """Wait until a job has ended; exit code 1 if it did not succeed."""
+def job_wait(job: JobId, timeout_s: float = 600.0) -> Answer:
+    """Wait until a job has ended; exit code 1 if it did not succeed.
+
+    Args:
+        timeout_s: Longest waiting time in seconds.
+    """
     with service(workers=MANY) as client:
         return table(finished(client, client.job(job), timeout_s), COLUMNS)
 

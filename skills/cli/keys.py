@@ -1,13 +1,14 @@
 """Commands of API keys, on the installation itself."""
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from skills.cli.commands import command
+from skills.cli.connecting import installation
 from skills.cli.output import Answer, say, table, warn
 
 if TYPE_CHECKING:
@@ -24,12 +25,19 @@ COLUMNS = ("key", "owner", "role", "surgeons", "created_at", "expires_at", "stat
 
 @command(keys)
 def create(
-    owner: Annotated[str, typer.Argument(help="The owner's name, which events and releases record.")],
-    role: Annotated[Role, typer.Option(help="Each role includes the rights of those before it.")] = "reader",
-    days: Annotated[int | None, typer.Option(min=1, max=3650, help="Validity in days; unlimited by default.")] = None,
-    surgeon: Annotated[list[str] | None, typer.Option(help="Restrict it to this surgeon; repeatable.")] = None,
+    owner: str,
+    role: Role = "reader",
+    days: Annotated[int | None, typer.Option(min=1, max=3650)] = None,
+    surgeon: list[str] | None = None,
 ) -> Answer:
-    """Create a key, and print its secret, which is shown only this once."""
+    """Create a key, and print its secret, which is shown only this once.
+
+    Args:
+        owner: The owner's name, which events and releases record.
+        role: Each role includes the rights of those before it.
+        days: Validity in days; unlimited by default.
+        surgeon: Restrict it to this surgeon; repeatable.
+    """
     from skills.db import now
     from skills.library.people.keys import about_key, create_key
     from skills.schemas.people import NewKey
@@ -57,8 +65,12 @@ def list_all() -> Answer:
 
 
 @command(keys)
-def revoke(key: Annotated[str, typer.Argument(help="Its id: the eight characters after skills_.")]) -> Answer:
-    """Revoke a key: within a second every service of this installation refuses it."""
+def revoke(key: str) -> Answer:
+    """Revoke a key: within a second every service of this installation refuses it.
+
+    Args:
+        key: Its id: the eight characters after skills_.
+    """
     from skills.library.people.keys import about_key, revoke_key
 
     with _database() as database, database.writing() as session:
@@ -69,10 +81,9 @@ def revoke(key: Annotated[str, typer.Argument(help="Its id: the eight characters
 @contextmanager
 def _database() -> Iterator["Database"]:
     """Open the database of this installation, migrated, and update the file of erasures afterwards."""
-    from skills.db.session import Database
     from skills.settings import settings
 
-    with closing(Database(settings().database_url)) as database:
+    with installation() as database:
         database.migrate()
         yield database
         if (file := settings().erasures_file) is not None:
@@ -81,6 +92,6 @@ def _database() -> Iterator["Database"]:
             keep_up_erasures(database, file)
 
 
-def _with_surgeons(about: "Key") -> dict[str, Any]:  # a row of a table
+def _with_surgeons(about: "Key") -> dict[str, object]:  # a row of a table
     surgeons = "all" if about.surgeons is None else ", ".join(about.surgeons) or "none any more"
     return about.model_dump(mode="json") | {"surgeons": surgeons}

@@ -1,14 +1,13 @@
 """Commands on the installation itself: serve, worker, migrate, seed, backup, restore, erasures, verify, doctor."""
 
 import gc
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from skills.cli.commands import KEY, command, read_key
-from skills.cli.connecting import service
+from skills.cli.connecting import installation, service
 from skills.cli.output import Answer, err, outcome, say, status_line, table, warn
 from skills.errors import NotReady, SkillsError
 
@@ -54,13 +53,17 @@ Lists = Annotated[
 
 @command(commands)
 def serve(
-    host: Annotated[str | None, typer.Option(help="The address to listen on; SKILLS_HOST by default.")] = None,
-    port: Annotated[
-        int | None, typer.Option(help="The port to listen on; SKILLS_PORT by default.", min=0, max=65535)
-    ] = None,
-    samples: Annotated[bool, typer.Option(help="Load the sample surgeons and train them first.")] = False,
+    host: str | None = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
+    samples: Annotated[bool, typer.Option()] = False,
 ) -> None:
-    """Start the service and its workers; stop both with Ctrl-C."""
+    """Start the service and its workers; stop both with Ctrl-C.
+
+    Args:
+        host: The address to listen on; SKILLS_HOST by default.
+        port: The port to listen on; SKILLS_PORT by default.
+        samples: Load the sample surgeons and train them first.
+    """
     from skills.settings import settings
 
     given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
@@ -95,31 +98,31 @@ def migrate() -> Answer:
 
 
 @command(commands)
-def seed(
-    to: Annotated[
-        Path | None,
-        typer.Option("--files", help="Only write the recordings as files, into this folder.", file_okay=False),
-    ] = None,
-) -> Answer:
-    """Load the synthetic sample surgeons and their recordings."""
+def seed(to: Annotated[Path | None, typer.Option("--files", file_okay=False)] = None) -> Answer:
+    """Load the synthetic sample surgeons and their recordings.
+
+    Args:
+        to: Only write the recordings as files, into this folder.
+    """
     from skills.samples import load_samples, write_samples
 
     if to is not None:
         written = write_samples(to)
         return table([{"file": str(file), "surgeon": surgeon} for file, surgeon in written], ("file", "surgeon"))
-        return None
     with service() as client, err.status("loading"):
         return table(list(load_samples(client)), ("surgeon", "suture", "id", "report.path_states"))
 
 
 @command(commands)
-def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)]) -> Answer:
-    """Write everything that is stored into one file, while the service goes on working."""
-    from skills.db.session import Database
-    from skills.library.operation.backup import back_up
-    from skills.settings import settings
+def backup(to: Annotated[Path, typer.Argument(dir_okay=False)]) -> Answer:
+    """Write everything that is stored into one file, while the service goes on working.
 
-    with closing(Database(settings().database_url)) as database, status_line("backing up") as update:
+    Args:
+        to: A new file.
+    """
+    from skills.library.operation.backup import back_up
+
+    with installation() as database, status_line("backing up") as update:
         manifest = back_up(database, to, update)
     rows, size, taken = sum(table.rows for table in manifest.tables), to.stat().st_size, manifest.created_at
     sentence = f"{to}: {rows} rows, {size / 1e6:.1f} MB, the state of {taken}."
@@ -128,15 +131,16 @@ def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False
 
 @command(commands)
 def restore(
-    source: Annotated[Path, typer.Argument(help="A file that `skills backup` wrote.", dir_okay=False)],
-    erasures: Lists = None,
-    check: Annotated[bool, typer.Option("--check", help="Only check the backup; write nothing.")] = False,
+    source: Annotated[Path, typer.Argument(dir_okay=False)], erasures: Lists = None, check: bool = False
 ) -> Answer:
     """Fill an empty database from a backup, and repeat everything that was ended since the backup.
 
     That is, erasures, withdrawals, revoked keys and narrowed consents, from the lists of --erasures.
+
+    Args:
+        source: A file that `skills backup` wrote.
+        check: Only check the backup; write nothing.
     """
-    from skills.db.session import Database
     from skills.jobs import refuse_left_over
     from skills.library.operation import backup as library
     from skills.settings import settings
@@ -147,7 +151,7 @@ def restore(
         return outcome(f"{source} is whole: {rows} rows of {taken}.", whole=True, rows=rows, created_at=taken)
     refuse_left_over(settings())
     sources, listed = _listed_in(erasures)
-    with closing(Database(settings().database_url)) as database, status_line("restoring") as update:
+    with installation() as database, status_line("restoring") as update:
         done = library.restore(database, source, listed, update)
     rows, taken = sum(table.rows for table in done.manifest.tables), done.manifest.created_at
     ended = {name: count for name, count in vars(done).items() if name != "manifest"}
@@ -162,13 +166,12 @@ def accept_rollback(erasures: Lists = None) -> Answer:
     A service refuses such a database until this command is given; the event is logged, and the saved heads of its
     history are set aside. Restore the right copy instead where there is one.
     """
-    from skills.db.session import Database
     from skills.jobs import refuse_left_over
     from skills.library.operation import backup as library
     from skills.settings import settings
 
     sources, listed = _listed_in(erasures)
-    with closing(Database(settings().database_url)) as database, status_line("accepting"):
+    with installation() as database, status_line("accepting"):
         try:
             database.compare_history()
         except NotReady:  # otherwise there is nothing to accept, as the next call says
@@ -209,15 +212,15 @@ def _again(sources: list[str], ended: dict[str, int]) -> str:
 
 
 @command(commands)
-def erasures(
-    to: Annotated[Path, typer.Argument(help="The list; it grows with each erasure. Keep it apart from the backups.")],
-) -> Answer:
-    """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`."""
-    from skills.db.session import Database
-    from skills.library.operation.erasure_list import keep_erasures
-    from skills.settings import settings
+def erasures(to: Path) -> Answer:
+    """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`.
 
-    with closing(Database(settings().database_url)) as database:
+    Args:
+        to: The list; it grows with each erasure. Keep it apart from the backups.
+    """
+    from skills.library.operation.erasure_list import keep_erasures
+
+    with installation() as database:
         listed = keep_erasures(database, to)
     surgeons, demos = len(listed.surgeons), len(listed.demos)
     others = {kind: len(names) for kind, names in listed.ended.items() if kind != "demonstrations"}
@@ -229,35 +232,24 @@ def erasures(
 
 @command(commands)
 def verify(
-    bag: Annotated[
-        Path | None, typer.Argument(help="A bag for replay; by default the whole installation is verified.")
-    ] = None,
-    decode_all: Annotated[
-        bool, typer.Option("--decode-all", help="Decode every recording again, and not only the newest.")
-    ] = False,
-    head: Annotated[
-        Path | None,
-        typer.Option(
-            help="A file of signed checkpoints that was kept elsewhere, by default the file of SKILLS_CHECKPOINTS or "
-            "beside the signing key: the history must continue each of them.",
-            dir_okay=False,
-        ),
-    ] = None,
-    key: Annotated[
-        str | None,
-        typer.Option(help=KEY),
-    ] = None,
-    relearn: Annotated[
-        bool,
-        typer.Option("--relearn", help="Cut and learn every policy again, from its recordings, settings and seed."),
-    ] = False,
-    limit: Annotated[
-        int | None, typer.Option(help="Of --relearn: at most this number of policies, drawn at random.", min=1)
-    ] = None,
+    bag: Annotated[Path | None, typer.Argument()] = None,
+    decode_all: bool = False,
+    head: Annotated[Path | None, typer.Option(dir_okay=False)] = None,
+    key: Annotated[str | None, typer.Option(help=KEY)] = None,
+    relearn: bool = False,
+    limit: Annotated[int | None, typer.Option(min=1)] = None,
 ) -> Answer:
     """Check every digest, reference and leaf of the history of this installation, or one replay bag.
 
     The exit code is 1 if anything is wrong.
+
+    Args:
+        bag: A bag for replay; by default the whole installation is verified.
+        decode_all: Decode every recording again, and not only the newest.
+        head: A file of signed checkpoints that was kept elsewhere, by default the file of SKILLS_CHECKPOINTS or beside
+            the signing key: the history must continue each of them.
+        relearn: Cut and learn every policy again, from its recordings, settings and seed.
+        limit: Of --relearn: at most this number of policies, drawn at random.
     """
     if bag is not None:
         from skills.formats.verify import verify_bag
@@ -265,7 +257,6 @@ def verify(
         with bag.open("rb") as file:
             lines = verify_bag(file, None if key is None else read_key(key))
         return outcome("\n".join(lines), whole=True, checked=lines)
-    from skills.db.session import Database
     from skills.library.operation.history import sign_some_history
     from skills.library.operation.inspection import inspect_installation
     from skills.library.recordings.recordings import confined_reader
@@ -273,11 +264,7 @@ def verify(
     from skills.transparency.notes import read_notes
 
     found: dict[str, Checked] = {}
-    with (
-        closing(Database(settings().database_url)) as database,
-        confined_reader(settings()) as reader,
-        status_line("verifying") as update,
-    ):
+    with installation() as database, confined_reader(settings()) as reader, status_line("verifying") as update:
         heads = None if head is None else read_notes(head.read_text())
         sign_some_history(database)
         for part in inspect_installation(
@@ -317,10 +304,12 @@ def state_of(part: "Checked") -> str:
 
 
 @command(commands, "public-key")
-def public_key(
-    to: Annotated[Path | None, typer.Argument(help="A file to write it to as well.", dir_okay=False)] = None,
-) -> Answer:
-    """Print the public key of the service, which verifies bags, policies, cards and the history offline."""
+def public_key(to: Annotated[Path | None, typer.Argument(dir_okay=False)] = None) -> Answer:
+    """Print the public key of the service, which verifies bags, policies, cards and the history offline.
+
+    Args:
+        to: A file to write it to as well.
+    """
     with service() as client:
         key = client.checkpoint().verifier
     if to is not None:

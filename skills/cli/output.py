@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -82,11 +82,18 @@ def warn(*sentences: str, style: str = "red") -> None:
 
 def show_table(rows: Any, columns: Sequence[str]) -> None:
     """Print some fields of a result, or of a list of them, by paths such as `report.path_states`, as a table."""
+    listed = rows if isinstance(rows, list) else [rows]
+    cells = [[reduce(_field, name.split("."), row) for name in columns] for row in listed]
+    show_cells([name.rpartition(".")[2] for name in columns], cells)
+
+
+def show_cells(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Print rows of cells as a table; a row may be shorter than the columns."""
     table = Table(box=None, pad_edge=False)
     for name in columns:
-        table.add_column(name.rpartition(".")[2], overflow="fold")
-    for row in rows if isinstance(rows, list) else [rows]:
-        table.add_row(*(cell(reduce(_field, name.split("."), row)) for name in columns))
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*map(cell, row))
     out.print(table)
 
 

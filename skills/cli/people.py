@@ -1,7 +1,5 @@
 """Commands of surgeons and suture types."""
 
-from typing import Annotated
-
 import typer
 
 from skills.cli.commands import Surgeon, command
@@ -20,14 +18,15 @@ COLUMNS = ("surgeon", "skill_level", "handedness", "protocol", "created_at")
 
 @command(surgeons, "put")
 def surgeon_put(
-    surgeon: Annotated[str, typer.Argument(help="A pseudonym: lower-case letters, digits, - and _.")],
-    about: SurgeonKeywords,
-    consent: Annotated[
-        list[str] | None, typer.Option(help="A use that the surgeon agreed to: training, export or atlas; repeatable.")
-    ] = None,
-    until: Annotated[str | None, typer.Option(help="The last day of the consent, such as 2030-12-31.")] = None,
+    surgeon: str, about: SurgeonKeywords, consent: list[str] | None = None, until: str | None = None
 ) -> Answer:
-    """Create or replace a surgeon; options that are left out are cleared."""
+    """Create or replace a surgeon; options that are left out are cleared.
+
+    Args:
+        surgeon: A pseudonym: lower-case letters, digits, - and _.
+        consent: A use that the surgeon agreed to: training, export or atlas; repeatable.
+        until: The last day of the consent, such as 2030-12-31.
+    """
     if consent:
         about["consent"] = {"uses": consent, "until": until}
     with service() as client:
@@ -56,11 +55,12 @@ def suture_list() -> Answer:
 
 
 @command(commands)
-def erase(
-    surgeon: Surgeon,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
-) -> Answer:
-    """Erase a surgeon and everything derived from their data, permanently."""
+def erase(surgeon: Surgeon, yes: bool = False) -> Answer:
+    """Erase a surgeon and everything derived from their data, permanently.
+
+    Args:
+        yes: Do not ask for confirmation.
+    """
     if not yes:
         typer.confirm(f"Erase '{surgeon}', all recordings, policies and plans, permanently?", abort=True, err=True)
     with service() as client:

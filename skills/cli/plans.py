@@ -35,19 +35,19 @@ def plan(
     surgeon: Surgeon,
     suture: Suture,
     options: PlanKeywords,
-    point: Annotated[
-        list[str] | None, typer.Option(help="A suture point, as x,y,z in mm; repeatable, one for each pass.")
-    ] = None,
-    scene: Annotated[
-        Path | None,
-        typer.Option(help="Take the suture points from a simulator's MCAP file: the exit points of the needle."),
-    ] = None,
+    point: list[str] | None = None,
+    scene: Path | None = None,
     obstacles: Obstacles = None,
     approach: Approach = None,
     base: Base = None,
     handoff: NoHandoff = False,
 ) -> Answer:
-    """Stack the released policy at suture points."""
+    """Stack the released policy at suture points.
+
+    Args:
+        point: A suture point, as x,y,z in mm; repeatable, one for each pass.
+        scene: Take the suture points from a simulator's MCAP file: the exit points of the needle.
+    """
     from skills.schemas.plans import SuturePointIn
 
     if point and scene is not None:
@@ -85,13 +85,13 @@ def _set_hand_off(
         options["handoff"] = "none"
 
 
-def psm_m_of(approach: str | None, base: str | None) -> dict[str, Any] | None:
+def psm_m_of(approach: str | None, base: str | None) -> dict[str, object] | None:
     """Return PSM_M as a request states it; None: as demonstrated, or none.
 
     Raises:
         BadInput: An option is not numbers.
     """
-    psm_m: dict[str, Any] = {} if approach is None else {"approach": triple(approach)}
+    psm_m: dict[str, object] = {} if approach is None else {"approach": triple(approach)}
     if base is not None:
         x, y, z, *turned = numbers(base, 7)  # position, then quaternion
         psm_m["base"] = {"position_mm": (x, y, z), "rotation_xyzw": turned}
@@ -136,12 +136,12 @@ def _drawn(found: "Reach") -> list[str]:
 
 
 @command(commands)
-def plans(
-    plan_id: Annotated[
-        str | None, typer.Argument(metavar="PLAN", help="Show this plan; without it the plans are listed.")
-    ] = None,
-) -> Answer:
-    """List plans, the newest first, or show one."""
+def plans(plan_id: Annotated[str | None, typer.Argument(metavar="PLAN")] = None) -> Answer:
+    """List plans, the newest first, or show one.
+
+    Args:
+        plan_id: Show this plan; without it the plans are listed.
+    """
     with service() as client:
         if plan_id is None:
             about = ("id", "surgeon", "suture", "policy.version", "passes", "hands_over", "feasible", "created_at")
@@ -153,19 +153,15 @@ def plans(
 
 @command(commands)
 def play(
-    plan_id: PlanId,
-    errors: Annotated[
-        str | None,
-        typer.Option(
-            help="Errors of the arms: calibrated, uncalibrated, or a JSON file with your own (docs/errors.md)."
-        ),
-    ] = None,
-    picture: Annotated[Path | None, typer.Option(help="Write a picture here.")] = None,
-    pictures: Annotated[
-        Path | None, typer.Option(help="Write the picture, a film and two plots to this folder.")
-    ] = None,
+    plan_id: PlanId, errors: str | None = None, picture: Path | None = None, pictures: Path | None = None
 ) -> Answer:
-    """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible."""
+    """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible.
+
+    Args:
+        errors: Errors of the arms: calibrated, uncalibrated, or a JSON file with your own (docs/errors.md).
+        picture: Write a picture here.
+        pictures: Write the picture, a film and two plots to this folder.
+    """
     from skills.schemas.results import PlaybackResult
 
     with service(workers=1) as client:
@@ -215,14 +211,19 @@ def arm_errors_of(errors: str | None) -> Any:
 @command(commands)
 def export(
     plan_id: PlanId,
-    to: Annotated[Path, typer.Argument(help="The zip to write.", dir_okay=False)],
-    pass_index: Annotated[int | None, typer.Option("--pass", help="A single pass, counted from 0.")] = None,
-    no_handoff: Annotated[
-        bool, typer.Option("--no-handoff", help="Needed for a plan without a hand-off: no PSM_M, no A2.")
-    ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
+    to: Annotated[Path, typer.Argument(dir_okay=False)],
+    pass_index: Annotated[int | None, typer.Option("--pass")] = None,
+    no_handoff: bool = False,
+    force: bool = False,
 ) -> Answer:
-    """Write the bag of a plan that a robot or a simulator replays; read docs/replay.md first."""
+    """Write the bag of a plan that a robot or a simulator replays; read docs/replay.md first.
+
+    Args:
+        to: The zip to write.
+        pass_index: A single pass, counted from 0.
+        no_handoff: Needed for a plan without a hand-off: no PSM_M, no A2.
+        force: Replace the file if it exists.
+    """
     if to.exists() and not force:
         raise BadInput(f"{to} exists already, and may be the bag of another plan.", "Replace it: --force")
     with service() as client, bar("fetching") as progress:

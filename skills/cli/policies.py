@@ -51,14 +51,9 @@ def train(
     surgeon: Surgeon,
     suture: Suture,
     options: TrainingKeywords,
-    combine: Annotated[
-        Literal["medoid", "barycentre", "corridor"] | None,
-        typer.Option(help="Way to combine several demonstrations into one path; a corridor by default."),
-    ] = None,
+    combine: Literal["medoid", "barycentre", "corridor"] | None = None,
     scene: SceneFile = None,
-    scene_cost: Annotated[
-        list[str] | None, typer.Option(help="Cost of the scene, as name=number; repeatable. Example: touch=100.")
-    ] = None,
+    scene_cost: list[str] | None = None,
     learner: Learner = None,
     setting: Setting = None,
     join: Join = None,
@@ -66,6 +61,10 @@ def train(
     """Learn a style from its newest demonstration, or from the given ones, and wait until it is learnt.
 
     With --release, the exit code is 1 if the style does not serve the version afterwards.
+
+    Args:
+        combine: Way to combine several demonstrations into one path; a corridor by default.
+        scene_cost: Cost of the scene, as name=number; repeatable. Example: touch=100.
     """
     from skills.schemas.training import TrainingResult
 
@@ -86,12 +85,7 @@ def train(
 
 
 @command(commands)
-def retrain(
-    options: RetrainingKeywords,
-    learner: Learner = None,
-    setting: Setting = None,
-    join: Join = None,
-) -> Answer:
+def retrain(options: RetrainingKeywords, learner: Learner = None, setting: Setting = None, join: Join = None) -> Answer:
     """Learn many styles again, and wait for them; exit code 1 if one failed, or with --release was not released."""
     if (chosen := _learner(learner, setting or [], join)) is not None:
         options["learner"] = chosen
@@ -122,13 +116,13 @@ def _refusal(style: "RetrainedStyle") -> str | None:
     return f"{style.surgeon}, {style.suture}: {compared.not_released_because} {compared.remedy}"
 
 
-def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[str, Any] | None:
+def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[str, object] | None:
     """Return the learner as JSON for the service; None for the default one."""
     if kind is None and settings:
         raise BadInput("--setting needs --learner.", "Example: --learner dqn --setting steps=100000")
     if kind is None and join is None:
         return None
-    learner: dict[str, Any] = {"kind": kind or DEFAULT_LEARNER}
+    learner: dict[str, object] = {"kind": kind or DEFAULT_LEARNER}
     if join is not None:
         joining = _joining()
         if learner["kind"] not in joining:
@@ -144,7 +138,7 @@ def _joining() -> list[str]:
     return [kind for kind, learner in LEARNERS.items() if any(one.name == "join_share" for one in fields(learner))]
 
 
-def _settings(option: str, settings: list[str]) -> dict[str, Any]:
+def _settings(option: str, settings: list[str]) -> dict[str, object]:
     """Return the settings of an option by name."""
     found = {}
     for setting in settings:
@@ -279,12 +273,13 @@ def policy_withdraw(surgeon: Surgeon, suture: Suture) -> Answer:
 
 @command(policies, "export")
 def policy_export(
-    surgeon: Surgeon,
-    suture: Suture,
-    to: Annotated[Path, typer.Argument(help="A file that ends in .json, or in .npz for the Q values.", dir_okay=False)],
-    version: OneVersion = None,
+    surgeon: Surgeon, suture: Suture, to: Annotated[Path, typer.Argument(dir_okay=False)], version: OneVersion = None
 ) -> Answer:
-    """Write the released policy, or a version, to a file, after verifying every number of it against its digest."""
+    """Write the released policy, or a version, to a file, after verifying every number of it against its digest.
+
+    Args:
+        to: A file that ends in .json, or in .npz for the Q values.
+    """
     with service() as client:
         client.save_policy(surgeon, suture, to, version)
     return written(to, f"{to}: verified against its digest. Research use only.")
@@ -292,12 +287,13 @@ def policy_export(
 
 @command(policies, "card")
 def policy_card(
-    surgeon: Surgeon,
-    suture: Suture,
-    version: TheVersion,
-    to: Annotated[Path, typer.Argument(help="A file that ends in .html, or in .json.", dir_okay=False)],
+    surgeon: Surgeon, suture: Suture, version: TheVersion, to: Annotated[Path, typer.Argument(dir_okay=False)]
 ) -> Answer:
-    """Write the card of a version: its data, learner, figures, limits, and everything that it rests on."""
+    """Write the card of a version: its data, learner, figures, limits, and everything that it rests on.
+
+    Args:
+        to: A file that ends in .html, or in .json.
+    """
     with service() as client:
         client.save_policy_card(surgeon, suture, version, to)
     return written(to, f"{to}: {to.stat().st_size / 1e6:.1f} MB. Research use only.")
@@ -307,10 +303,15 @@ def policy_card(
 def policy_signature(
     surgeon: Surgeon,
     suture: Suture,
-    to: Annotated[Path, typer.Argument(help="The file to write, such as policy.dsse.", dir_okay=False)],
-    card_of: Annotated[int | None, typer.Option("--card", help="Sign the card of this version instead.")] = None,
+    to: Annotated[Path, typer.Argument(dir_okay=False)],
+    card_of: Annotated[int | None, typer.Option("--card")] = None,
 ) -> Answer:
-    """Write the service's signature of the released policy: of its JSON, its arrays and its pose style."""
+    """Write the service's signature of the released policy: of its JSON, its arrays and its pose style.
+
+    Args:
+        to: The file to write, such as policy.dsse.
+        card_of: Sign the card of this version instead.
+    """
     with service() as client:
         client.save_signature(surgeon, suture, to, card_of)
     return written(to, f"{to}: check a file with `skills policy verify FILE {to.name} --key KEY`.")
@@ -318,11 +319,16 @@ def policy_signature(
 
 @command(policies, "verify")
 def policy_verify(
-    file: Annotated[Path, typer.Argument(help="A policy, its arrays, its pose style or a card.", dir_okay=False)],
-    signature: Annotated[Path, typer.Argument(help="The service's signature of it.", dir_okay=False)],
+    file: Annotated[Path, typer.Argument(dir_okay=False)],
+    signature: Annotated[Path, typer.Argument(dir_okay=False)],
     key: Key,
 ) -> Answer:
-    """Check offline that the service with this key signed exactly this file, and print what it said of it."""
+    """Check offline that the service with this key signed exactly this file, and print what it said of it.
+
+    Args:
+        file: A policy, its arrays, its pose style or a card.
+        signature: The service's signature of it.
+    """
     from skills.transparency.statements import read_envelope
 
     content, envelope = file.read_bytes(), read_envelope(signature.read_bytes())
@@ -340,12 +346,13 @@ def policy_verify(
 
 @command(commands)
 def rollout(
-    surgeon: Surgeon,
-    suture: Suture,
-    start: Annotated[str, typer.Option(help="The start, as x,y,z in mm in the policy's frame.")],
-    version: OneVersion = None,
+    surgeon: Surgeon, suture: Suture, start: Annotated[str, typer.Option()], version: OneVersion = None
 ) -> Answer:
-    """Follow the released policy from a position to the goal."""
+    """Follow the released policy from a position to the goal.
+
+    Args:
+        start: The start, as x,y,z in mm in the policy's frame.
+    """
     with service() as client:
         followed = client.rollout(surgeon, suture, triple(start), version)
     end = "reaches the goal" if followed.finished else "stops before the goal"

@@ -46,19 +46,16 @@ RecordingId = Annotated[str, typer.Argument(help="The recording's digest.")]
 def recording_add(
     path: RecordingPath,
     about: TableKeywords,
-    episode: Annotated[
-        str | None,
-        typer.Option(help="An episode of a LeRobot dataset by its number, or all: each becomes a recording."),
-    ] = None,
+    episode: str | None = None,
     tool: Tool = None,
-    surgeon: Annotated[
-        str | None,
-        typer.Option(
-            help="The surgeon who was recorded: `skills erase` then finds it.", autocompletion=complete_surgeons
-        ),
-    ] = None,
+    surgeon: Annotated[str | None, typer.Option(autocompletion=complete_surgeons)] = None,
 ) -> Answer:
-    """Store a recording, and list the hand-offs proposed in it."""
+    """Store a recording, and list the hand-offs proposed in it.
+
+    Args:
+        episode: An episode of a LeRobot dataset by its number, or all: each becomes a recording.
+        surgeon: The surgeon who was recorded: `skills erase` then finds it.
+    """
     if episode == "all":
         return _add_all(path, about, tool, surgeon)
     with service() as client, ready_one(path, about, episode, tool) as (file, progress):
@@ -68,10 +65,7 @@ def recording_add(
 
 @command(recordings, "preview")
 def recording_preview(
-    path: RecordingPath,
-    about: TableKeywords,
-    episode: OneEpisode = None,
-    tool: Tool = None,
+    path: RecordingPath, about: TableKeywords, episode: OneEpisode = None, tool: Tool = None
 ) -> Answer:
     """Show what would be understood of a recording, above all of a table; nothing is stored."""
     with service() as client, ready_one(path, about, episode, tool) as (file, progress):
@@ -195,13 +189,13 @@ HEADINGS = ("recording", "source", "stated", "format", "samples", "understood", 
 
 
 @command(recordings, "table")
-def recording_table(
-    folder: Annotated[Path, typer.Argument(help="A folder with recordings, at any depth.", file_okay=False)],
-    stated: Annotated[
-        Path | None, typer.Option(help="A TOML file with what the recordings do not say (docs/recordings.md).")
-    ] = None,
-) -> Answer:
-    """Show what would be understood of each recording in a folder, and why others are refused; nothing is stored."""
+def recording_table(folder: Annotated[Path, typer.Argument(file_okay=False)], stated: Path | None = None) -> Answer:
+    """Show what would be understood of each recording in a folder, and why others are refused; nothing is stored.
+
+    Args:
+        folder: A folder with recordings, at any depth.
+        stated: A TOML file with what the recordings do not say (docs/recordings.md).
+    """
     from skills.schemas.recordings import StatedIn
 
     statements = {} if stated is None else _statements(stated)
@@ -315,14 +309,17 @@ Note = Annotated[str | None, typer.Option(help="Why.")]
 
 @command(proposals, "list")
 def proposal_list(
-    state: Annotated[
-        Literal["open", "accepted", "rejected"] | None, typer.Option(help="Only those in this state.")
-    ] = None,
-    recording: Annotated[str | None, typer.Option(help="Only those of this recording, by its digest.")] = None,
+    state: Literal["open", "accepted", "rejected"] | None = None,
+    recording: str | None = None,
     surgeon: OfSurgeon = None,
     suture: OfSuture = None,
 ) -> Answer:
-    """List the hand-offs proposed in recordings, those of the newest recording first."""
+    """List the hand-offs proposed in recordings, those of the newest recording first.
+
+    Args:
+        state: Only those in this state.
+        recording: Only those of this recording, by its digest.
+    """
     with service() as client:
         return _proposals(client.proposals(state, recording=recording, surgeon=surgeon, suture=suture))
 

@@ -16,14 +16,19 @@ commands = typer.Typer()
 
 @command(commands)
 def report(
-    to: Annotated[Path, typer.Option(help="The folder to write to.")] = Path("build/report"),
-    irl_iterations: Annotated[int, typer.Option(min=1, help="Iterations of maximum-entropy IRL, for Fig. 5.")] = 200,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for each learner.")] = 200,
-    runs: Annotated[
-        int, typer.Option(min=1, help="Runs of each policy and rival, for each probability of a slip.")
-    ] = 1000,
+    to: Path = Path("build/report"),
+    irl_iterations: Annotated[int, typer.Option(min=1)] = 200,
+    seeds: Annotated[int, typer.Option(min=1)] = 200,
+    runs: Annotated[int, typer.Option(min=1)] = 1000,
 ) -> Answer:
-    """Redraw the paper's Figures 5 to 9 and Table I, compared with rivals: pictures and one HTML page."""
+    """Redraw the paper's Figures 5 to 9 and Table I, compared with rivals: pictures and one HTML page.
+
+    Args:
+        to: The folder to write to.
+        irl_iterations: Iterations of maximum-entropy IRL, for Fig. 5.
+        seeds: Number of seeds for each learner.
+        runs: Runs of each policy and rival, for each probability of a slip.
+    """
     if find_spec("movement_primitives") is None:
         raise BadInput(
             "The figures have a movement primitive as a rival, whose library is not installed here.",

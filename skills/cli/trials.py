@@ -26,22 +26,20 @@ Tasks = Annotated[list[str] | None, typer.Option("--task", help="Only this task,
 
 @command(jigsaws, "add")
 def jigsaws_add(
-    folder: Annotated[
-        Path,
-        typer.Argument(help="A folder with TASK/kinematics/AllGestures/*.txt, their transcriptions and meta files."),
-    ],
+    folder: Path,
     task: Tasks = None,
-    suture: Annotated[
-        str | None,
-        typer.Option(
-            help="Make a demonstration of this suture type from each proposed hand-off.",
-            autocompletion=complete_sutures,
-        ),
-    ] = None,
-    arm: Annotated[Literal["PSM_left", "PSM_right"] | None, typer.Option(help="Only this arm.")] = None,
-    prefix: Annotated[str, typer.Option(help="Prefix of the pseudonyms, before the surgeon's letter.")] = "jigsaws",
+    suture: Annotated[str | None, typer.Option(autocompletion=complete_sutures)] = None,
+    arm: Literal["PSM_left", "PSM_right"] | None = None,
+    prefix: str = "jigsaws",
 ) -> Answer:
-    """Store every trial of a folder; exit code 1 if one was refused, while the others are stored."""
+    """Store every trial of a folder; exit code 1 if one was refused, while the others are stored.
+
+    Args:
+        folder: A folder with TASK/kinematics/AllGestures/*.txt, their transcriptions and meta files.
+        suture: Make a demonstration of this suture type from each proposed hand-off.
+        arm: Only this arm.
+        prefix: Prefix of the pseudonyms, before the surgeon's letter.
+    """
     from skills.samples import find_trials, send_trials
 
     found = find_trials(folder, task or ())
@@ -59,11 +57,12 @@ def jigsaws_add(
 
 
 @command(jigsaws, "evaluate")
-def jigsaws_evaluate(
-    folder: Annotated[Path, typer.Argument(help="A folder with TASK/kinematics/AllGestures/*.txt.", file_okay=False)],
-    task: Tasks = None,
-) -> Answer:
-    """Compare the hand-offs proposed from both hands' motion with the transcribed ones; nothing is stored."""
+def jigsaws_evaluate(folder: Annotated[Path, typer.Argument(file_okay=False)], task: Tasks = None) -> Answer:
+    """Compare the hand-offs proposed from both hands' motion with the transcribed ones; nothing is stored.
+
+    Args:
+        folder: A folder with TASK/kinematics/AllGestures/*.txt.
+    """
     from skills.samples import evaluate_hand_offs, find_trials
 
     found = find_trials(folder, task or ())

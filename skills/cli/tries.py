@@ -52,20 +52,12 @@ def try_bag(
     path: RecordingPath,
     options: TryKeywords,
     table: TableKeywords,
-    surgeon: Annotated[
-        str, typer.Option(help="The surgeon's pseudonym; a new one is added.", autocompletion=complete_surgeons)
-    ] = "surgeon-1",
-    suture: Annotated[str, typer.Option(help="The suture type.", autocompletion=complete_sutures)] = "simple-running",
-    errors: Annotated[
-        str | None,
-        typer.Option(help="Errors of the arms: calibrated, uncalibrated, or a JSON file (docs/errors.md); asked."),
-    ] = None,
+    surgeon: Annotated[str, typer.Option(autocompletion=complete_surgeons)] = "surgeon-1",
+    suture: Annotated[str, typer.Option(autocompletion=complete_sutures)] = "simple-running",
+    errors: str | None = None,
     approach: Approach = None,
     base: Base = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option(help="Keep everything in this folder; without it a temporary one is used, and deleted."),
-    ] = None,
+    folder: Path | None = None,
     episode: OneEpisode = None,
     tool: Tool = None,
     as_json: AsJson = False,
@@ -74,6 +66,12 @@ def try_bag(
 
     Exit code 0 with the verdict of a feasible plan, 1 if it is not feasible or a step was refused, 3 if a question is
     open.
+
+    Args:
+        surgeon: The surgeon's pseudonym; a new one is added.
+        suture: The suture type.
+        errors: Errors of the arms: calibrated, uncalibrated, or a JSON file (docs/errors.md); asked.
+        folder: Keep everything in this folder; without it a temporary one is used, and deleted.
     """
     options |= {"errors": arm_errors_of(errors), "psm_m": psm_m_of(approach, base)}
     printer = _StepPrinter(context, as_json)

@@ -51,13 +51,7 @@ class Demos(Connection):
         `active` true leaves out withdrawn ones, false all others; `outcome` all that are not marked so.
         """
         return await self._all(
-            Demonstration,
-            "/demos",
-            surgeon=surgeon,
-            suture=suture,
-            recording=recording,
-            active=active,
-            outcome=outcome,
+            Demonstration, "/demos", surgeon=surgeon, suture=suture, recording=recording, active=active, outcome=outcome
         )
 
     async def demo(self, demo: str) -> Demonstration:

@@ -109,17 +109,15 @@ class Plans(Connection):
         Raises:
             Problem: Of status 409 while the plan may not be replayed, with the reason.
         """
-        which: dict[str, Any] = {"plan": plan, "handoff": handoff, "pass": pass_index}
-        return await self._save(TRAJECTORY, to, progress, accept=BAG, **which)
+        which: Mapping[str, Any] = {"pass": pass_index}
+        return await self._save(TRAJECTORY, to, progress, accept=BAG, plan=plan, handoff=handoff, **which)
 
     async def compare(self, plan: str, demo: str, pass_index: int = 0) -> Comparison:
         """Compare a pass of a plan, counted from 0, with a demonstration cut from the recording of its replay."""
         return await self._get(Comparison, "/plans/{plan}/comparison", plan=plan, demo=demo, **{"pass": pass_index})
 
     async def play(
-        self,
-        plan: str,
-        errors: "Literal['calibrated', 'uncalibrated'] | ArmErrorsIn | Mapping[str, Any] | None" = None,
+        self, plan: str, errors: "Literal['calibrated', 'uncalibrated'] | ArmErrorsIn | Mapping[str, Any] | None" = None
     ) -> Job:
         """Request the playback of a plan in the simulator; the job's result is a `PlaybackResult`.
 

@@ -13,7 +13,7 @@ A session needs `websockets`, which is imported with this module, at the first s
 import json
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import httpx2 as httpx
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
@@ -70,7 +70,7 @@ class AsyncSession:
             raise BadInput(str(answer["error"]))
         return self._client._read(SessionPose, answer)
 
-    async def _exchange(self, text: str | None) -> dict[str, Any]:
+    async def _exchange(self, text: str | None) -> dict[str, object]:
         """Send a message, if there is one, and return the service's answer."""
         if self._socket is None:
             raise SessionClosed(None, "The session is not open; enter it with `with`.")

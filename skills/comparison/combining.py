@@ -316,9 +316,5 @@ def _of_majority(away_mm: Floats) -> Floats:
 
 def _votes(ways_mm: Floats, along_mm: Floats) -> Floats:
     """Return the mean of each path's points, (N, T, 3), that are warped to each state of one, (S, 3): (N, S, 3)."""
-    votes = []
-    for one in ways_mm:
-        pairs = dtw(one, along_mm).pairs
-        warped = np.stack([np.bincount(pairs[:, 1], axis) for axis in one[pairs[:, 0]].T], axis=1)
-        votes.append(warped / np.bincount(pairs[:, 1])[:, None])
-    return np.stack(votes)
+    aligned = [dtw(one, along_mm) for one in ways_mm]
+    return np.stack([to.at_reference(one[to.pairs[:, 0]]) for one, to in zip(ways_mm, aligned, strict=True)])

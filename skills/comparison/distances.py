@@ -318,8 +318,7 @@ def difference(shape: Floats, reference: Floats) -> Difference:
     aligned = dtw(shape, reference)
     states = aligned.pairs[:, 1]
     signed = shape[aligned.pairs[:, 0]] - reference[states]
-    paired = np.bincount(states, minlength=len(reference))[:, None]
-    along = np.stack([np.bincount(states, axis, len(reference)) for axis in signed.T], axis=1) / paired
+    along = aligned.at_reference(signed)
     third = np.arange(len(reference)) * len(PARTS) // len(reference)
     offsets = np.stack(
         [along[third == part].mean(axis=0) if (third == part).any() else np.zeros(3) for part in range(len(PARTS))]

@@ -41,6 +41,11 @@ class Alignment:
         """The Manhattan distance summed over all pairs; independent of the tie-break."""
         return float(self.differences_mm.sum())
 
+    def at_reference(self, values: Floats) -> Floats:
+        """Return the mean of the values of the pairs, (K, D), at each point of the reference, (R, D)."""
+        points = self.pairs[:, 1]
+        return np.stack([np.bincount(points, column) for column in values.T], axis=1) / np.bincount(points)[:, None]
+
 
 def dtw(path_mm: ArrayLike, reference_mm: ArrayLike) -> Alignment:
     """Align two paths of different length and measure their distance.

@@ -283,7 +283,7 @@ class PolicyManifest(Given):
         return None if self.scene is None else Surroundings(self.scene.scene, self.scene.costs)
 
     @property
-    def digested(self) -> dict[str, Any]:
+    def digested(self) -> dict[str, object]:
         """The plain JSON of which the digest is computed."""
         return self.model_dump(mode="json", exclude_none=True)
 

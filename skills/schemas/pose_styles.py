@@ -169,10 +169,7 @@ class NextIn(Schema):
     With an orientation it is a pose, and the pose style answers; the phases are then those of the pose style.
     """
 
-    model_config = shown(
-        {"position_mm": [-10.0, 55.0, -135.0]},
-        {"position_mm": [-15.0, 55.0, -130.0], "phase": 1},
-    )
+    model_config = shown({"position_mm": [-10.0, 55.0, -135.0]}, {"position_mm": [-15.0, 55.0, -130.0], "phase": 1})
 
     position_mm: PointIn
     rotation_xyzw: QuaternionIn | None = None

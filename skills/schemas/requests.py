@@ -3,9 +3,10 @@
 Unknown fields, NaN and infinity are refused. Every pattern has a description in words, for messages.
 """
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import ConfigDict, Field, StrictInt
+from pydantic.config import JsonDict
 
 from skills.fields import Documented
 
@@ -59,6 +60,6 @@ Component = Annotated[Number, Field(ge=-1e6, le=1e6)]
 QuaternionIn = tuple[Component, Component, Component, Component]
 
 
-def shown(*examples: dict[str, Any]) -> ConfigDict:
+def shown(*examples: JsonDict) -> ConfigDict:
     """Return a configuration with examples for the OpenAPI document; a test sends each of them."""
     return ConfigDict(json_schema_extra={"examples": [*examples]})

@@ -3,7 +3,8 @@
 `Job.result` is plain JSON, because its form depends on the kind of the job; each class here is that of one kind.
 """
 
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Self
 
 from skills.fields import Sha256
 from skills.schemas import Given
@@ -53,6 +54,6 @@ class ProposedSegments(Given):
     segments: tuple[NumberedSegment, ...]
 
     @classmethod
-    def of(cls, numbers: dict[str, Any]) -> Self:
+    def of(cls, numbers: Mapping[str, object]) -> Self:
         """Return the proposals that the numbers of a refusal list."""
         return cls.model_validate(numbers)

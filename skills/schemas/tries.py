@@ -91,5 +91,5 @@ class TryStep(Given):
     state: Literal["done", "asks", "refused"]
     text: str
     choices: tuple[Choice, ...] = ()
-    remedies: tuple[str | dict[str, Any], ...] = ()
+    remedies: tuple[str | dict[str, str | int], ...] = ()
     id: str | None = None

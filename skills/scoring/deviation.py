@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skills.arrays import Flags, Floats, xyz
+from skills.arrays import Flags, Floats, interpolated, xyz
 from skills.comparison.distances import PARTS, STATES, TREMOR_S, Difference, difference, own_axes, resampled, shape_of
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip, spans_of
@@ -322,20 +322,20 @@ def traced(demo: Demo, onto_mm: Floats) -> Traced:
     resting = _at_rest(seconds, speed)
     step_s = np.append(0.0, np.diff(seconds))
     at_mm = np.linspace(0.0, along_mm[-1], STATES)
-    clocks = [np.interp(at_mm, along_mm, np.cumsum(step_s * on)) for on in (~resting, resting)]
+    clocks_s = interpolated(at_mm, along_mm, np.cumsum(step_s[:, None] * np.stack([~resting, resting], axis=1), axis=0))
     shape_mm = laid(shape_of(demo), onto_mm)
-    pairs = dtw(_by_phase(shape_mm, onto_mm), _by_phase(onto_mm, onto_mm)).pairs
-    count = np.bincount(pairs[:, 1], minlength=STATES)
+    aligned = dtw(_by_phase(shape_mm, onto_mm), _by_phase(onto_mm, onto_mm))
 
     def mean(values: Floats) -> Floats:
-        return np.bincount(pairs[:, 1], values[pairs[:, 0]], STATES) / count
+        return aligned.at_reference(values[aligned.pairs[:, 0]])
 
     turns = None
     if demo.rotation_xyzw is not None:
         turned = smoothed_tip(demo.stamps_s, same_signs(demo.rotation_xyzw), TREMOR_S)[1]
-        there = np.stack([mean(np.interp(at_mm, along_mm, axis)) for axis in turned.T], axis=1)
+        there = mean(interpolated(at_mm, along_mm, turned))
         turns = multiplied(quaternion_of(own_axes(resampled(tip_mm))[None])[0], unit(there))
-    return Traced(np.stack([mean(axis) for axis in shape_mm.T], axis=1), mean(clocks[0]), mean(clocks[1]), turns)
+    moving_s, resting_s = mean(clocks_s).T
+    return Traced(mean(shape_mm), moving_s, resting_s, turns)
 
 
 def _by_phase(shape_mm: Floats, onto_mm: Floats) -> Floats:

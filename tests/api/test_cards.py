@@ -5,7 +5,6 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from skills.library.policies.versions import find_version
 from skills.packing import sha256
 from skills.schemas.cards import PolicyCard
 from tests import backends
+from tests.api.html import Html
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
 
@@ -27,30 +27,6 @@ CARD = f"{POLICY}/versions/1/card"
 PAGE = {"Accept": "text/html"}
 DOCUMENT = Path(__file__).parents[2] / "docs" / "policy-card.md"
 NASTY = "<script>alert(1)</script>&\"'`{{ 7*7 }}"
-
-
-class Document(HTMLParser):
-    """A page's tags, attributes and text; the text of drawings is collected separately."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.attributes: list[tuple[str, str | None]] = []
-        self.text = ""
-        self._skipped = 0
-        self.feed(html)
-
-    def handle_starttag(self, tag: str, attrs: list) -> None:
-        self.tags.append(tag)
-        self.attributes += attrs
-        self._skipped += tag in ("svg", "style")
-
-    def handle_endtag(self, tag: str) -> None:
-        self._skipped -= tag in ("svg", "style")
-
-    def handle_data(self, data: str) -> None:
-        if not self._skipped:
-            self.text += data + " "
 
 
 def card_of(service: Service, path: str = CARD) -> dict:
@@ -170,7 +146,7 @@ def test_every_number_of_the_page_is_in_the_json(trained: Service):
         numbers = [abs(one) for one in said if isinstance(one, int | float)]
         words = re.sub(r"(:\d\d)\.\d+Z", r"\1", " ".join(one for one in said if isinstance(one, str)))
         in_words = {float(one) for one in re.findall(r"\d+(?:\.\d+)?", words)}
-        shown = re.findall(r"\d+(?:,\d{3})*(?:\.\d+)?", Document(page_of(trained, path)).text)
+        shown = re.findall(r"\d+(?:,\d{3})*(?:\.\d+)?", Html(page_of(trained, path)).text)
         assert len(shown) > 100
         for one in shown:
             value, digits = float(one.replace(",", "")), len(one.partition(".")[2])
@@ -180,8 +156,8 @@ def test_every_number_of_the_page_is_in_the_json(trained: Service):
 
 def test_the_page_is_one_file_that_runs_nothing_and_fetches_nothing(still: Service):
     answer = still.http.get(CARD, headers=PAGE)
-    document = Document(answer.text)
-    assert not {"script", "img", "link", "iframe", "object", "a", "form", "use"} & set(document.tags)
+    document = Html(answer.text)
+    assert not {"script", "img", "link", "iframe", "object", "a", "form", "use"} & set(document.names)
     names = [name for name, _ in document.attributes]
     assert not [name for name in names if name in ("href", "src", "style") or name.startswith("on")]
     assert not re.search(r"https?://|@import", answer.text)
@@ -283,7 +259,7 @@ def test_a_withdrawn_demonstration_is_told_in_plain_words(trained: Service):
     card = card_of(trained)
     assert card["demonstrations"][0]["state"] == "withdrawn"
     assert (card["status"]["released_now"], card["status"]["releasable"]) == (False, False)
-    text = " ".join(Document(page_of(trained)).text.split())
+    text = " ".join(Html(page_of(trained)).text.split())
     assert "The demonstration was withdrawn. Withdrawn on" in text
     assert "do not use this policy" in text
     assert "It cannot be released: its demonstration was withdrawn." in text
@@ -303,7 +279,7 @@ def test_a_refused_version_has_a_card_that_says_why(trained: Service):
     card = card_of(trained, path)
     certified = card["certificate"]["refused_because"]
     assert card["status"]["refused_because"] == [one["text"] for one in certified] != []
-    text = " ".join(Document(page_of(trained, path)).text.split())
+    text = " ".join(Html(page_of(trained, path)).text.split())
     for reason in card["status"]["refused_because"]:
         assert reason in text
     assert "the cell alone, as in the paper" in text

@@ -1,21 +1,8 @@
 """`DELETE /recordings/{recording}`: for its uploader or an admin, and not while demonstrations depend on it."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-
-from tests import backends
 from tests.api.keyed import As, key
-from tests.api.service import CSV, KESTREL, Service, assert_problem, serving
+from tests.api.service import CSV, KESTREL, Service, assert_problem
 from tests.library import cases
-
-
-@pytest.fixture
-def service(tmp_path: Path) -> Iterator[Service]:
-    with serving(backends.fresh("sqlite", tmp_path)) as service:
-        service.client.put_surgeon("kestrel")
-        yield service
 
 
 def send(whom: As, shift: float, query: str = "") -> str:
@@ -25,9 +12,9 @@ def send(whom: As, shift: float, query: str = "") -> str:
     return answer.json()["id"]
 
 
-def test_its_uploader_or_an_admin_deletes_a_recording(service: Service):
+def test_its_uploader_or_an_admin_deletes_a_recording(here: Service):
     anna, bert, admin = (
-        As(service, key(service, owner, role))
+        As(here, key(here, owner, role))
         for owner, role in (("anna", "uploader"), ("bert", "releaser"), ("ada", "admin"))
     )
     sent, other, cut = send(anna, 0.0), send(anna, 2.5), send(anna, 5.0)
@@ -40,8 +27,8 @@ def test_its_uploader_or_an_admin_deletes_a_recording(service: Service):
         assert "erase=true" in assert_problem(whom("DELETE", f"/recordings/{cut}"), 409)["detail"]
 
 
-def test_a_recording_that_was_uploaded_as_a_surgeons_goes_with_the_surgeon(service: Service):
-    local = As(service, key(service, "ada", "admin"))
+def test_a_recording_that_was_uploaded_as_a_surgeons_goes_with_the_surgeon(here: Service):
+    local = As(here, key(here, "ada", "admin"))
     sent, nobodys = send(local, 0.0, "?surgeon=kestrel"), send(local, 2.5)
     answer = local("POST", "/recordings?surgeon=nobody", content=cases.hand_off(), headers={"Content-Type": CSV})
     assert_problem(answer, 404, "not-found")

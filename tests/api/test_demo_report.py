@@ -6,7 +6,6 @@ import io
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from skills.demonstration.recording import Motion, Recording
 from skills.formats import read_recording, write_mcap
 from skills.kinematics import matrix_of, quaternion_of
 from skills.seeds.recordings import sample_recordings
+from tests.api.html import Html
 from tests.api.service import CSV, GOAL_MM, KESTREL, Service, assert_problem
 from tests.demonstration import sessions
 from tests.library import cases
@@ -32,35 +32,11 @@ NUMBERS = (
 
 
 @pytest.fixture
-def here(service: Service) -> Service:
-    service.client.put_surgeon("kestrel")
-    return service
-
-
-@pytest.fixture
 def plover(here: Service) -> dict:
     """Store a hesitant demonstration with two presses of the clutch and a tremor."""
     sample = next(s for s in sample_recordings() if s.surgeon == "plover")
     start_s, end_s = sample.segments[0]
     return here.client.add_demo(sample.data, **KESTREL, start_s=start_s, end_s=end_s)
-
-
-class Page(HTMLParser):
-    """The parsed content of a page: its tags, their attributes, and its text."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.attributes: list[tuple[str, str | None]] = []
-        self.text = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list) -> None:
-        self.tags.append(tag)
-        self.attributes += attrs
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def test_a_report_says_all_that_is_measured(here: Service, plover: dict):
@@ -80,9 +56,9 @@ def test_a_report_says_all_that_is_measured(here: Service, plover: dict):
 def test_a_report_is_a_page_for_people(here: Service, plover: dict):
     answer = here.http.get(f"/demos/{plover['id']}/report", headers=PAGE)
     assert answer.headers["content-type"].startswith("text/html")
-    page = Page(answer.text)
-    assert {"h1", "svg", "polyline", "rect", "table"} <= set(page.tags)
-    assert page.tags.count("svg") >= 4, "three views and the speed"
+    page = Html(answer.text)
+    assert {"h1", "svg", "polyline", "rect", "table"} <= set(page.names)
+    assert page.names.count("svg") >= 4, "three views and the speed"
     for words in (*plover["report"]["advice"], "Path length", "Smoothness", "Turn in A1", "Self-crossings", "Clutch"):
         assert words in page.text
     assert f"{plover['report']['path_length_mm']:.1f} mm" in page.text
@@ -90,8 +66,8 @@ def test_a_report_is_a_page_for_people(here: Service, plover: dict):
 
 def test_a_page_runs_nothing_and_fetches_nothing(here: Service, plover: dict):
     answer = here.http.get(f"/demos/{plover['id']}/report", headers=PAGE)
-    page = Page(answer.text)
-    assert not {"script", "img", "link", "iframe", "object", "a", "form"} & set(page.tags)
+    page = Html(answer.text)
+    assert not {"script", "img", "link", "iframe", "object", "a", "form"} & set(page.names)
     assert not [name for name, _ in page.attributes if name in ("href", "src", "style") or name.startswith("on")]
     style = re.search("<style>(.*?)</style>", answer.text, re.DOTALL)[1]
     allowed = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
@@ -102,7 +78,7 @@ def test_a_page_runs_nothing_and_fetches_nothing(here: Service, plover: dict):
 
 def test_the_page_states_the_outcome_and_what_it_means(here: Service, plover: dict):
     def said() -> str:
-        return " ".join(Page(here.http.get(f"/demos/{plover['id']}/report", headers=PAGE).text).text.split())
+        return " ".join(Html(here.http.get(f"/demos/{plover['id']}/report", headers=PAGE).text).text.split())
 
     assert "Outcome: not known." in said()
     here.client.mark_demo(plover["id"], "success")

@@ -11,12 +11,6 @@ from tests.api.service import CSV, KESTREL, MCAP, Service, assert_problem
 from tests.library import cases
 
 
-@pytest.fixture
-def here(service: Service) -> Service:
-    service.client.put_surgeon("kestrel")
-    return service
-
-
 def post(service: Service, path: str, data: bytes, media_type: str = CSV, **query: object) -> httpx.Response:
     return service.http.post(path, params=query, content=data, headers={"Content-Type": media_type})
 

@@ -1,6 +1,5 @@
 """Rows that decide about serving, edited past the service: they are compared with the history when they are read."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,16 +12,10 @@ from skills.library.operation.history import sign_history
 from skills.library.people.keys import digest_of
 from tests import backends
 from tests.api.keyed import As, key
-from tests.api.service import KESTREL, POLICY, Service, assert_problem, copy_of_trained, serving
+from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving
 from tests.library import cases
 
 AT = f"/history?surgeon=kestrel&suture={cases.SUTURE}&at="
-
-
-@pytest.fixture
-def trained(tmp_path: Path) -> Iterator[Service]:
-    with serving(copy_of_trained(tmp_path)) as service:
-        yield service
 
 
 def assert_not_served(service: Service) -> None:

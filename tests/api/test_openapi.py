@@ -4,13 +4,13 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from typing import Any
 
 import pytest
 
 from skills.seeds.recordings import sample_recordings
 from tests.api.conformance import conformance
+from tests.api.html import Html
 from tests.api.service import GOAL_MM, KESTREL, Service
 
 OPERATIONS = {
@@ -135,16 +135,6 @@ def test_every_example_of_a_request_does_what_it_shows(trained: Service, method:
 # ---- readability for people and clients -------------------------------------------------------------------------
 
 
-class Links(HTMLParser):
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.addresses: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.addresses += [value or "" for name, value in attributes if name in ("href", "src", "action")]
-
-
 def test_the_calls_are_shown_on_a_page_without_an_outside_address(still: Service):
     answer = still.http.get("/docs")
     assert answer.status_code == 200
@@ -152,7 +142,7 @@ def test_the_calls_are_shown_on_a_page_without_an_outside_address(still: Service
     policy = answer.headers["content-security-policy"]
     assert "script-src 'self'; style-src 'self';" in policy
     assert "unsafe" not in policy and "http" not in policy
-    addresses = Links(answer.text).addresses
+    addresses = Html(answer.text).addresses
     assert all(one.startswith(("/", "#")) and not one.startswith("//") for one in addresses), addresses
     for name in ("swagger-ui-bundle.js", "swagger-ui.css", "reference.js"):
         (file,) = (one for one in addresses if one.endswith(f"/{name}"))

@@ -3,7 +3,7 @@
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from datetime import timedelta
 from pathlib import Path
@@ -113,73 +113,43 @@ def test_what_is_not_ready_is_a_problem_with_a_name(service: Service):
     assert service.http.get("/healthz").status_code == 200
 
 
-def damage_missing(settings: Settings) -> None:
-    database_file(settings).unlink()
-
-
-def damage_replaced(settings: Settings) -> None:
-    database_file(settings).write_bytes(b"not a database " * 1000)
-
-
-def damage_empty(settings: Settings) -> None:
-    database_file(settings).write_bytes(b"")
-
-
-def damage_folder(settings: Settings) -> None:
-    database_file(settings).unlink()
-    database_file(settings).mkdir()
-
-
-def damage_other_version(settings: Settings) -> None:
-    statement(settings, "UPDATE alembic_version SET version_num = '9999'")
-
-
-def damage_tables(settings: Settings) -> None:
-    statement(settings, "PRAGMA foreign_keys=OFF", "DROP TABLE suture_types")
-
-
-def damage_engine_missing(settings: Settings) -> None:
-    engine_file(settings).unlink()
-
-
-def damage_engine_replaced(settings: Settings) -> None:
-    engine_file(settings).write_bytes(b"not a database " * 1000)
-
-
-def damage_engine_empty(settings: Settings) -> None:
-    engine_file(settings).write_bytes(b"")
-
-
-def damage_silent_worker(settings: Settings) -> None:
-    beat(settings, hours=1)
-
-
-def damage_no_worker(settings: Settings) -> None:
-    statement(settings, "DELETE FROM executors")
-
-
 def statement(settings: Settings, *statements: str) -> None:
     with sqlite3.connect(database_file(settings)) as connection:
         for one in statements:
             connection.execute(one)
 
 
-@pytest.mark.parametrize(
-    ("damage", "said"),
-    [
-        (damage_missing, "The database does not exist"),
-        (damage_replaced, "The database cannot be read and written"),
-        (damage_empty, "has no tables yet. Ask the operator of the service to migrate"),
-        (damage_folder, "The database does not exist"),
-        (damage_other_version, "is of another version; use the code that made it"),
-        (damage_tables, "The database cannot be read and written"),
-        (damage_engine_missing, "The job engine's database does not exist"),
-        (damage_engine_replaced, "The job engine's database cannot be used"),
-        (damage_engine_empty, "The job engine's database cannot be used"),
-        (damage_silent_worker, "No worker has renewed its lease"),
-        (damage_no_worker, "No worker has renewed its lease"),
-    ],
-)
+def make_folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
+NO_DATABASE = b"not a database " * 1000
+DAMAGED: dict[str, tuple[Callable[[Settings], object], str]] = {
+    "missing": (lambda s: database_file(s).unlink(), "The database does not exist"),
+    "replaced": (lambda s: database_file(s).write_bytes(NO_DATABASE), "The database cannot be read and written"),
+    "empty": (
+        lambda s: database_file(s).write_bytes(b""),
+        "has no tables yet. Ask the operator of the service to migrate",
+    ),
+    "folder": (lambda s: make_folder(database_file(s)), "The database does not exist"),
+    "other version": (
+        lambda s: statement(s, "UPDATE alembic_version SET version_num = '9999'"),
+        "is of another version; use the code that made it",
+    ),
+    "tables": (
+        lambda s: statement(s, "PRAGMA foreign_keys=OFF", "DROP TABLE suture_types"),
+        "The database cannot be read and written",
+    ),
+    "engine missing": (lambda s: engine_file(s).unlink(), "The job engine's database does not exist"),
+    "engine replaced": (lambda s: engine_file(s).write_bytes(NO_DATABASE), "The job engine's database cannot be used"),
+    "engine empty": (lambda s: engine_file(s).write_bytes(b""), "The job engine's database cannot be used"),
+    "silent worker": (lambda s: beat(s, hours=1), "No worker has renewed its lease"),
+    "no worker": (lambda s: statement(s, "DELETE FROM executors"), "No worker has renewed its lease"),
+}
+
+
+@pytest.mark.parametrize(("damage", "said"), DAMAGED.values(), ids=DAMAGED)
 def test_every_part_that_cannot_be_used_is_told_in_time(installation: Settings, damage: Any, said: str):
     assert refuse_unready(installation) == 1
     damage(installation)

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterator
 from functools import cache
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.versions import find_version
 from skills.schemas.people import SurgeonIn
 from tests import backends
+from tests.api.html import Html
 from tests.api.keyed import As, copy_of_told, key
 from tests.api.service import CSV, KESTREL, Service, assert_problem, serving
 from tests.library import cases, hospital
@@ -32,33 +32,6 @@ from tests.library import cases, hospital
 STYLE = f"/pages/styles/kestrel/{cases.SUTURE}"
 NASTY = """<script>alert(1)</script>'"><img src=x onerror=alert(2)>{{ 7 * 7 }}"""
 USE = "not a medical device"
-
-
-class Html(HTMLParser):
-    """A page's tags with their attributes, and its text."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-    def addresses(self) -> Iterator[str]:
-        for _, about in self.tags:
-            yield from (value or "" for name, value in about.items() if name in ("href", "src", "action"))
-
-
-@pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """Yield a service in which kestrel has everything up to a playback with pictures, and heron a demonstration."""
-    with serving(copy_of_told(tmp_path_factory.mktemp("told"))) as service:
-        yield service
 
 
 def every_page(service: Service) -> list[str]:
@@ -101,10 +74,8 @@ def test_every_page_runs_our_files_alone_and_says_what_it_is_not(told: Service) 
         for tag, about in page.tags:
             assert tag != "style" and "style" not in about and not any(name.startswith("on") for name in about), path
             assert tag != "script" or (about.get("src") or "").startswith("/static/"), path
-        assert all(address.startswith(("/", "#")) and not address.startswith("//") for address in page.addresses()), (
-            path
-        )
-        assert all(f"/static/{build()}/" in address for address in page.addresses() if address.startswith("/static/"))
+        assert all(address.startswith(("/", "#")) and not address.startswith("//") for address in page.addresses), path
+        assert all(f"/static/{build()}/" in address for address in page.addresses if address.startswith("/static/"))
 
 
 def test_the_policy_lets_nothing_in_that_is_not_ours(told: Service) -> None:
@@ -135,7 +106,7 @@ def test_behind_a_prefix_every_address_has_it(tmp_path: Path) -> None:
         service.http = TestClient(service.app, str(service.http.base_url), root_path="/lab/skills")
         for path in every_page(service):
             page = page_of(service, path)
-            assert all(address.startswith(("/lab/skills/", "#")) for address in page.addresses()), path
+            assert all(address.startswith(("/lab/skills/", "#")) for address in page.addresses), path
             assert ("meta", {"name": "root", "content": "/lab/skills"}) in page.tags
 
 
@@ -321,13 +292,13 @@ def test_the_catalogue_reaches_every_surgeon_page_by_page_and_by_search(crowded:
     path, shown = "/pages/catalogue", []
     while path:
         page = page_of(crowded, path)
-        here = [at.rpartition("/")[2] for at in page.addresses() if at.startswith("/pages/surgeons/")]
+        here = [at.rpartition("/")[2] for at in page.addresses if at.startswith("/pages/surgeons/")]
         assert len(here) <= MOST
         shown += here
-        path = next((at for at in page.addresses() if "cursor=" in at), "")
+        path = next((at for at in page.addresses if "cursor=" in at), "")
     assert len(shown) == 220 and shown == sorted(set(shown))
     found = page_of(crowded, "/pages/catalogue?q=N-19")
-    assert [at for at in found.addresses() if at.startswith("/pages/surgeons/")] == [
+    assert [at for at in found.addresses if at.startswith("/pages/surgeons/")] == [
         f"/pages/surgeons/wren-19{digit}" for digit in range(10)
     ]
     assert "No pseudonym contains nobody." in page_of(crowded, "/pages/catalogue?q=nobody").text

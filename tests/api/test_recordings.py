@@ -1,45 +1,34 @@
 """`GET /recordings`: a page of all recordings that the caller may see."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from skills.formats import write_mcap
-from tests import backends
-from tests.api.service import CSV, KESTREL, Service, serving
+from tests.api.service import CSV, KESTREL, Service
 from tests.demonstration import sessions
 from tests.library import cases
 
 
-@pytest.fixture
-def service(tmp_path: Path) -> Iterator[Service]:
-    with serving(backends.fresh("sqlite", tmp_path)) as service:
-        service.client.put_surgeon("kestrel")
-        yield service
-
-
-def test_recordings_are_listed_the_newest_first_page_by_page(service: Service):
-    assert service.http.get("/recordings").json() == {"items": [], "next": None}
+def test_recordings_are_listed_the_newest_first_page_by_page(here: Service):
+    assert here.http.get("/recordings").json() == {"items": [], "next": None}
     sent = []
     for shift in (0.0, 2.5, 5.0):
         how = {"content": cases.hand_off((shift, 0.0, 0.0)), "headers": {"Content-Type": CSV}}
-        sent.append(service.http.post("/recordings", **how).json()["id"])
-    first = service.http.get("/recordings", params={"limit": 2}).json()
-    second = service.http.get("/recordings", params={"limit": 2, "cursor": first["next"]}).json()
+        sent.append(here.http.post("/recordings", **how).json()["id"])
+    first = here.http.get("/recordings", params={"limit": 2}).json()
+    second = here.http.get("/recordings", params={"limit": 2, "cursor": first["next"]}).json()
     assert [one["id"] for one in first["items"] + second["items"]] == sent[::-1]
     assert second["next"] is None
 
 
-def test_a_line_has_the_counts_of_what_is_in_the_recording(service: Service):
+def test_a_line_has_the_counts_of_what_is_in_the_recording(here: Service):
     value, truths = sessions.session(sessions.Kind(seed=1, passes=2))
-    stored = service.client.add_recording(write_mcap(value))
+    stored = here.client.add_recording(write_mcap(value))
     mine = next(one for one in stored["segments"] if one["arm"] == sessions.A)
     part = {"arm": sessions.A, "start_s": mine["start_s"], "end_s": mine["end_s"]}
-    demo = service.client.cut_demo(stored["id"], **KESTREL, **part)
-    (line,) = service.http.get("/recordings").json()["items"]
+    demo = here.client.cut_demo(stored["id"], **KESTREL, **part)
+    (line,) = here.http.get("/recordings").json()["items"]
     assert (line["arms"], line["demos"], line["format"]) == (["PSM1", "PSM2"], 1, "mcap")
     assert line["segments"] == len(stored["segments"]) > len(truths)
     assert line["duration_s"] == pytest.approx(value.duration_s)
-    assert service.http.delete(f"/demos/{demo['id']}").is_success
-    assert service.http.get("/recordings").json()["items"][0]["demos"] == 0
+    assert here.http.delete(f"/demos/{demo['id']}").is_success
+    assert here.http.get("/recordings").json()["items"][0]["demos"] == 0

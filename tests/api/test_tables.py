@@ -19,12 +19,6 @@ SAID = {"column": ["x=PosX", "y=PosY", "z=PosZ"], "unit": ["mm"], "frame": "base
 POSITIONS = written.positions().encode()
 
 
-@pytest.fixture
-def here(service: Service) -> Service:
-    service.client.put_surgeon("kestrel")
-    return service
-
-
 def send(service: Service, path: str, data: bytes, **query):
     return service.http.post(path, params=query, content=data, headers={"Content-Type": CSV})
 

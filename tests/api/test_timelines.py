@@ -1,7 +1,6 @@
 """Timelines over HTTP: columns of each kind of resource, the file for viewers, and who may have them."""
 
 import io
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,12 +14,6 @@ from tests.api.keyed import copy_of_told
 from tests.api.service import Service, assert_problem, serving
 
 MCAP = {"Accept": "application/vnd.mcap"}
-
-
-@pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    with serving(copy_of_told(tmp_path_factory.mktemp("timelines"))) as service:
-        yield service
 
 
 def digests(service: Service) -> dict[str, str]:

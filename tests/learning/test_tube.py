@@ -17,6 +17,7 @@ from skills.learning.pose_step import Hands, advance, next_pose
 from skills.learning.pose_style import PHASES, PosePath
 from skills.learning.tube import CertifiedPoses, Update, certify_tube, clear_tube
 from skills.learning.tube_certificate import TubeClearance, TubeLimits
+from tests.by_day import some
 from tests.learning.loops import run_both
 
 LIMITS = TubeLimits(step_mm=6.0, step_rad=0.2, disturbance_mm=1.0, disturbance_rad=0.02, start_mm=20.0, start_rad=0.5)
@@ -86,14 +87,9 @@ def turns(hands: Hands) -> Rotation:
     return Rotation.from_quat(hands.rotation_xyzw)
 
 
-def test_no_run_leaves_the_tube_and_all_arrive_in_time() -> None:
-    held_in_the_tube(300, seed=1)
-
-
-@pytest.mark.nightly
-def test_a_million_runs_stay_in_the_tube() -> None:
-    for seed in range(34):  # 10 000 runs under each of three limits
-        held_in_the_tube(10_000, seed)
+@pytest.mark.parametrize(("runs", "seed"), some([(300, 1), *((10_000, seed) for seed in range(34))], 35))
+def test_no_run_leaves_the_tube_and_all_arrive_in_time(runs: int, seed: int) -> None:
+    held_in_the_tube(runs, seed)  # under each of three limits, so at night a million
 
 
 def too_long(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:

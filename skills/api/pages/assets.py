@@ -9,6 +9,7 @@ import hashlib
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from pathlib import PurePath
 
 TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 BORROWED = {  # from their packages: name, package, folder in it
@@ -33,7 +34,10 @@ def assets() -> dict[str, Asset]:
     files = {file.name: file.read_bytes() for file in own.iterdir() if file.is_file()}
     for name, (package, folder) in BORROWED.items():
         files[name] = (resources.files(package) / folder / name).read_bytes()
-    return {name: _asset(name, content) for name, content in files.items() if _ending(name) in TYPES}
+    kinds = {name: TYPES.get(PurePath(name).suffix) for name in files}
+    # without a time, so that the same build has the same bytes
+    packed = {name: gzip.compress(content, compresslevel=5, mtime=0) for name, content in files.items()}
+    return {name: Asset(files[name], packed[name], kind) for name, kind in kinds.items() if kind is not None}
 
 
 @cache
@@ -43,11 +47,3 @@ def build() -> str:
     for name, asset in sorted(assets().items()):
         seen.update(name.encode() + hashlib.sha256(asset.content).digest())
     return seen.hexdigest()[:16]
-
-
-def _asset(name: str, content: bytes) -> Asset:
-    return Asset(content, gzip.compress(content, compresslevel=5, mtime=0), TYPES[_ending(name)])
-
-
-def _ending(name: str) -> str:
-    return name[name.rfind(".") :]

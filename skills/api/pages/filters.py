@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
 from math import degrees
-from typing import Any
 
+from skills.arrays import Floats
 from skills.library.operation.styles import StyleState
 from skills.library.plans.headline import describe_error
 
@@ -68,7 +68,7 @@ def share(value: float | None, digits: int = 1) -> str:
     return f"{text} %"
 
 
-def outline(style: StyleState) -> dict[str, Any] | None:
+def outline(style: StyleState) -> dict[str, object] | None:
     """Return the drawing of a style as a thumbnail: its path in the box of its grid, in a square of 100 by 100 units.
 
     The view is orthographic, from above one corner. None if there is nothing to draw.
@@ -111,7 +111,19 @@ def _line(points: Sequence[Seen]) -> str:
     return " ".join(f"{u},{v}" for u, v in points)
 
 
+def px(value: float) -> str:
+    """Return a length in a drawing, rounded to 0.01."""
+    return f"{round(value, 2):g}"
+
+
+def points(way: Floats) -> str:
+    """Return the points of a polyline, shape (T, 2)."""
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in way.tolist())
+
+
 FILTERS = {
+    "px": px,
+    "points": points,
     "number": number,
     "triple": triple,
     "moment": moment,

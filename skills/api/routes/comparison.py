@@ -142,11 +142,10 @@ def show_atlas(
     except (Conflict, BadInput) as refused:
         raise NotFound(refused.words()) from refused  # rendered as a page that states the reason
     pairs = sorted(found.differences, key=lambda one: -one.distance)[:MOST_PAIRS]
-    marks = drawings.marks(found)
     drawn = {
         "chart": drawings.chart(found),
         "matrix": drawings.matrix(found),
-        "marks": {surgeon: drawings.key(mark) for surgeon, mark in marks.items()},
+        "marks": drawings.keys(found),
         "thirds": [drawings.thirds(one.shares) for one in pairs],
         "most": drawings.MOST_GROUPS,
     }

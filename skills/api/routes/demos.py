@@ -21,7 +21,7 @@ from skills.api.dependencies import (
 from skills.api.openapi import ends, gives, gives_file, makes, router_of
 from skills.api.pages import standalone_headers
 from skills.api.pages.drawings import report_page
-from skills.api.responses import HTML, JSON, Condition, Giving, negotiate, refuse_changed, stored
+from skills.api.responses import HTML, JSON, Giving, IfMatch, negotiate, stored
 from skills.api.routes.recordings import RAW_BODY, uploads
 from skills.api.streams import stored_file
 from skills.api.uploads import Incoming
@@ -129,9 +129,7 @@ def get_reward_map(demo: Digest, db: Db, give: Giving) -> Response:
 
 
 @router.put("/demos/{demo}/outcome", **gives("releaser", Demonstration, 404, 412))
-def mark_demo(
-    demo: Digest, body: OutcomeIn, db: Db, give: Giving, actor: Actor, if_match: Condition = None
-) -> Response:
+def mark_demo(demo: Digest, body: OutcomeIn, db: Db, give: Giving, actor: Actor, conditions: IfMatch) -> Response:
     """Mark a demonstration as success, recovery or failure; the last two withdraw the releases that rest on it.
 
     Releases of versions that were trained with outcomes "any" stay.
@@ -139,27 +137,23 @@ def mark_demo(
     with db.reading() as session:
         surgeon = demos.find_demo(session, demo).surgeon.slug
     with db.writing([locks.surgeon(surgeon)]) as session:
-        if if_match:
-            refuse_changed(Demonstration.model_validate(demos.find_demo(session, demo)), if_match)
+        conditions.refuse_changed(Demonstration.model_validate(demos.find_demo(session, demo)))
         return give(Demonstration.model_validate(demos.mark_demo(session, demo, body.outcome, body.reason, actor)))
 
 
 @router.delete("/demos/{demo}", **ends("releaser", 404, 409, 412))
-def withdraw_demo(
-    demo: Digest, db: Db, jobs: Jobs, caller: Asking, erase: bool = False, if_match: Condition = None
-) -> None:
+def withdraw_demo(demo: Digest, db: Db, jobs: Jobs, caller: Asking, conditions: IfMatch, erase: bool = False) -> None:
     """Withdraw a demonstration and the releases that rest on it; with `erase`, delete it and its derived data."""
     if erase:
-        caller.must_be("admin")
+        caller.must_be("admin")  # before anything is looked up, as the role of a route is
     dropped: erasure.Dropped = []
     with db.reading() as session:
         found = demos.find_demo(session, demo)
-        refuse_changed(Demonstration.model_validate(found), if_match)
+        conditions.refuse_changed(Demonstration.model_validate(found))
         surgeon, erased = found.surgeon.slug, erasure.erased_with(session, found.surgeon, found) if erase else []
     drop_contents(db, erased)
     with db.writing(None if erase else [locks.surgeon(surgeon)]) as session:
-        if if_match:
-            refuse_changed(Demonstration.model_validate(demos.find_demo(session, demo)), if_match)
+        conditions.refuse_changed(Demonstration.model_validate(demos.find_demo(session, demo)))
         demos.withdraw_demo(session, demo, caller.name)
         if erase:
             dropped = erasure.erase_demo(session, demo, caller.name)

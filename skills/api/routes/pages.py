@@ -4,7 +4,6 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
-import orjson
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
@@ -15,7 +14,7 @@ from skills.api.authorisation import Asking, Caller, needs, open_to_all
 from skills.api.dependencies import Configured, Db, Digest, JobId, Limit, Parse, RowCursor, Slug, SlugCursor, Version
 from skills.api.pages import drawings, render
 from skills.api.pages.assets import assets, build
-from skills.api.responses import JSON
+from skills.api.responses import JSON, say
 from skills.db.session import Database
 from skills.fields import Point
 from skills.formats import MEDIA_TYPES, SUFFIXES
@@ -42,6 +41,7 @@ STATUS: dict[type[Exception], int] = {errors.Erased: 410, errors.Conflict: 409, 
 LOST: tuple[type[Exception], ...] = (errors.NotFound, RequestValidationError, *STATUS)
 PSM_M_FROM_GOAL_MM = (155.0, -35.0, 145.0)  # ours, assumed: the base of the samples' PSM_M relative to their goal
 PSM_M_TURN = "0, 0, 0.382683, 0.92388"  # 45 degrees about z: the arms stand away from each other, and do not collide
+NOT_STORED = {"Cache-Control": "no-store"}
 FOR_GOOD = "public, max-age=31536000, immutable"
 
 Words = Annotated[str, Query(max_length=200)]
@@ -124,8 +124,8 @@ def show_catalogue(
     with page.db.reading() as session:
         found = styles.matrix(session, q, state or None, skill or None, cursor)
         asked = {"q": q, "state": state, "skill": skill}
-        known: dict[str, Any] = {"sutures": overview.all_suture_types(session), "most_counted": styles.MOST_COUNTED}
-        return page.show("catalogue.html", found=found, asked=asked, **known)
+        sutures, most = overview.all_suture_types(session), styles.MOST_COUNTED
+        return page.show("catalogue.html", found=found, asked=asked, sutures=sutures, most_counted=most)
 
 
 @router.get("/pages/styles/{surgeon}/{suture}", dependencies=[needs("reader")])
@@ -158,14 +158,14 @@ def _chosen(session: Session, whole: styles.WholeStyle, version: int | None) -> 
 def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, db: Db) -> Response:
     """Return the data of a version's 3-D view."""
     with db.reading() as session:
-        return _json(views.view_of_version(versions.choose(session, surgeon, suture, version)))
+        return say(views.view_of_version(versions.choose(session, surgeon, suture, version)), headers=NOT_STORED)
 
 
 @router.get("/pages/demos/{demo}/view", dependencies=[needs("reader")])
 def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
     """Return the data of a demonstration's 3-D view."""
     with db.reading() as session:
-        return _json(views.view_of_demo(session, shown_demo(session, demo)))
+        return say(views.view_of_demo(session, shown_demo(session, demo)), headers=NOT_STORED)
 
 
 @router.get("/pages/demos/{demo}/score", dependencies=[needs("reader")])
@@ -186,14 +186,18 @@ def show_score(
     score = scores.score(
         page.db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256, task=task or None), tell
     )
-    drawn: dict[str, Any] = {
-        "views": drawings.deviation_views(score.deviation),
-        "along": drawings.deviation_along(score.deviation),
-        "curve": drawings.score_curve(score.curve, found.sha256) if len(score.curve) > 1 else None,
-        "key": drawings.score_key(),
-    }
-    drawn |= {"surgeons": surgeons, "tasks": tasks, "asked_task": task}
-    return page.show("score.html", demo=found, score=score, **drawn)
+    return page.show(
+        "score.html",
+        demo=found,
+        score=score,
+        views=drawings.deviation_views(score.deviation),
+        along=drawings.deviation_along(score.deviation),
+        curve=drawings.score_curve(score.curve, found.sha256) if len(score.curve) > 1 else None,
+        key=drawings.score_key(),
+        surgeons=surgeons,
+        tasks=tasks,
+        asked_task=task,
+    )
 
 
 @router.get("/pages/recordings", dependencies=[needs("reader")])
@@ -240,7 +244,7 @@ def show_recording(recording: Digest, page: WebPage, surgeon: Picked = None, sut
 @router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
 def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Parse) -> Response:
     """Return the data of a recording's timeline."""
-    return _json(views.traces_of(db, recording, tell))
+    return say(views.traces_of(db, recording, tell), headers=NOT_STORED)
 
 
 @router.get("/pages/plans", dependencies=[needs("reader")])
@@ -356,7 +360,3 @@ def show_people(page: WebPage, q: Words = "", cursor: SlugCursor = None) -> Resp
             most=overview.MOST,
             sutures=overview.all_suture_types(session),
         )
-
-
-def _json(content: dict[str, Any]) -> Response:
-    return Response(orjson.dumps(content), headers={"Cache-Control": "no-store"}, media_type=JSON)

@@ -6,7 +6,7 @@ from fastapi import Path, Query, Response
 
 from skills.api.dependencies import Actor, Callers, Db, Jobs, ListingByRow, ListingBySlug, Slug
 from skills.api.openapi import ends, gives, makes, router_of, says
-from skills.api.responses import Condition, Conditional, Giving, refuse_changed, say, stored
+from skills.api.responses import Conditional, Giving, IfMatch, say, stored
 from skills.library.operation import locks
 from skills.library.operation.sweep import drop_contents, sweep_erased
 from skills.library.people import erasure, surgeons, suture_types
@@ -48,16 +48,15 @@ def get_surgeon(surgeon: Slug, db: Db, give: Giving) -> Response:
 
 
 @router.delete("/surgeons/{surgeon}", **ends("admin", 404, 410, 412))
-def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, if_match: Condition = None) -> None:
+def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, conditions: IfMatch) -> None:
     """Erase a surgeon and everything derived from their data, permanently."""
     with db.reading() as session:
         found = surgeons.find_surgeon(session, surgeon)
-        refuse_changed(Surgeon.model_validate(found), if_match)
+        conditions.refuse_changed(Surgeon.model_validate(found))
         recordings = erasure.erased_with(session, found)
     drop_contents(db, recordings)
     with db.writing() as session:
-        if if_match:
-            refuse_changed(Surgeon.model_validate(surgeons.find_surgeon(session, surgeon)), if_match)
+        conditions.refuse_changed(Surgeon.model_validate(surgeons.find_surgeon(session, surgeon)))
         dropped = erasure.erase_surgeon(session, surgeon, actor)
     sweep_erased(db)
     db.forget()  # erased data must not stay in SQLite's write-ahead log

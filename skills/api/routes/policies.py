@@ -134,8 +134,7 @@ def release(
     """
     with db.writing([locks.surgeon(surgeon)]) as session:
         policy = versions.find_version(session, surgeon, suture, version)
-        if if_match is not None:
-            _refuse_overtaken(session, encoded, surgeon, suture, if_match)
+        _refuse_overtaken(session, encoded, surgeon, suture, if_match)
         released = releases.release(session, policy, actor, constant_turn_deg=settings.constant_turn_deg)
         return say(summarise(released))
 
@@ -147,8 +146,7 @@ def withdraw(surgeon: Slug, suture: Slug, db: Db, encoded: Encoder, actor: Actor
     `If-Match` takes the ETag of the JSON that is served now.
     """
     with db.writing([locks.surgeon(surgeon)]) as session:
-        if if_match is not None:
-            _refuse_overtaken(session, encoded, surgeon, suture, if_match)
+        _refuse_overtaken(session, encoded, surgeon, suture, if_match)
         who, what = find_surgeon(session, surgeon), find_suture_type(session, suture)
         releases.withdraw(session, who, what.slug, actor)
 
@@ -180,12 +178,14 @@ async def follow(surgeon: Slug, suture: Slug, socket: WebSocket) -> None:
     await sessions.serve(socket, surgeon, suture)
 
 
-def _refuse_overtaken(session: Session, encoded: Encoded, surgeon: str, suture: str, if_match: str) -> None:
-    """Check that If-Match names the policy that is released now.
+def _refuse_overtaken(session: Session, encoded: Encoded, surgeon: str, suture: str, if_match: str | None) -> None:
+    """Check that If-Match, where it is sent, names the policy that is released now.
 
     Raises:
         PreconditionFailed: Another one is released now.
     """
+    if if_match is None:
+        return
     served = versions.policy_of(session, surgeon, suture)
     if not names(if_match, encoded.policy(served.policy, served.release, JSON).etag):
         raise PreconditionFailed("Another policy is released now; read it, then repeat the request.")

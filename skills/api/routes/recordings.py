@@ -9,7 +9,7 @@ from skills.api.authorisation import Asking, needs
 from skills.api.dependencies import Actor, Db, Digest, ListingByRow, OfRecording, OfSurgeon, Parse, RowCursor
 from skills.api.openapi import ends, gives, makes, router_of, says, uploads_of
 from skills.api.responses import Giving, say, stored
-from skills.api.routes.pages import Picked, WebPage
+from skills.api.routes.pages import NOT_STORED, Picked, WebPage
 from skills.api.routes.pages import router as page_router
 from skills.api.uploads import Incoming
 from skills.formats import BYTES, MEDIA_TYPES
@@ -150,4 +150,4 @@ def show_proposals(
 @page_router.get("/pages/recordings/{recording}/proposals", dependencies=[needs("reader")])
 def draw_proposals(recording: Digest, db: Db, parse: Parse) -> Response:
     """Return the paths of the tip in all proposals of a recording, for their small pictures."""
-    return say({"paths_mm": proposals.paths_of(db, recording, parse)}, headers={"Cache-Control": "no-store"})
+    return say({"paths_mm": proposals.paths_of(db, recording, parse)}, headers=NOT_STORED)

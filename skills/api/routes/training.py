@@ -50,10 +50,7 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
 
 @router.get("/retrainings/{job}", **gives("reader", Retraining, 404))
 def get_retraining(
-    job: JobId,
-    db: Db,
-    listing: ListingByRow,
-    state: Literal["queued", "done", "failed", "cancelled"] | None = None,
+    job: JobId, db: Db, listing: ListingByRow, state: Literal["queued", "done", "failed", "cancelled"] | None = None
 ) -> Response:
     """Return a batch: its job, the number of its styles in each state, and the styles, all or of one state."""
     with db.reading() as session:

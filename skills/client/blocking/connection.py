@@ -216,14 +216,14 @@ class Connection:
             self._sleep(pause_s)
 
 
-def fill(path: str, named: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+def fill(path: str, named: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
     """Return a path with the values of its fields, each quoted so that it stays one segment, and the other values."""
     fields = {name for _, name, _, _ in Formatter().parse(path) if name}
     quoted = {name: quote(str(named[name]), safe="") for name in fields}
     return path.format(**quoted), given({name: value for name, value in named.items() if name not in fields})
 
 
-def given(values: Mapping[str, Any]) -> dict[str, Any]:
+def given(values: Mapping[str, T]) -> dict[str, T]:
     """Return the entries that are not None."""
     return {name: value for name, value in values.items() if value is not None}
 

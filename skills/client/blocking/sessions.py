@@ -14,7 +14,7 @@ A session needs `websockets`, which is imported with this module, at the first s
 import json
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import httpx2 as httpx
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
@@ -71,7 +71,7 @@ class Session:
             raise BadInput(str(answer["error"]))
         return self._client._read(SessionPose, answer)
 
-    def _exchange(self, text: str | None) -> dict[str, Any]:
+    def _exchange(self, text: str | None) -> dict[str, object]:
         """Send a message, if there is one, and return the service's answer."""
         if self._socket is None:
             raise SessionClosed(None, "The session is not open; enter it with `with`.")
