@@ -1,6 +1,7 @@
 """The database: tables whose rows label values, sessions and transactions, serialisation, and backups.
 
-Here are the definitions that all tables share: names of constraints, UTC timestamps, digests, row numbers.
+Here are the definitions that all tables share: names of constraints, UTC timestamps, digests, row numbers, and the
+query of the newest rows.
 
 models           the tables of the library
 service_tables   the tables of the service: jobs, workers, keys, sign-ins, the audit log
@@ -117,6 +118,7 @@ class Base(DeclarativeBase):
     }
 
 
+# Columns stand in the order row, digest, those of the table, and time of creation, whatever class declares them.
 ROW = sa.BigInteger().with_variant(sa.Integer, "sqlite")
 RowId = Annotated[int, mapped_column(ROW, primary_key=True, autoincrement=True, sort_order=-2)]
 Number = Annotated[int, mapped_column(ROW)]  # a row, without a foreign key
