@@ -10,8 +10,8 @@ import subprocess
 import tempfile
 import uuid
 import warnings
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from tests.leftovers import shared
 from tests.needs import need
 from tests.waiting import until
 
+OTHER = {"sqlite": "postgresql", "postgresql": "sqlite"}
 BACKENDS = ("sqlite", "postgresql")  # as parameters of a test: by day `tests.by_day` decides
 
 
@@ -62,6 +63,16 @@ def drop(url: str) -> None:
     """Remove a database; a SQLite file is removed with its folder."""
     if url.startswith("postgresql"):
         on_server(f"DROP DATABASE IF EXISTS {make_url(url).database} WITH (FORCE)")
+
+
+@contextmanager
+def opened(url: str) -> Iterator[Database]:
+    """Open a database, which is closed and dropped at the end."""
+    try:
+        with closing(Database(url)) as database:
+            yield database
+    finally:
+        drop(url)
 
 
 def migrated_file() -> Path:

@@ -450,8 +450,7 @@ EQUIVALENT: dict[tuple[str, str], str] = {
     ): "a salt is random and kept beside its digest; one byte more recognises the same pseudonym",
     (
         "skills/library/people/erasure.py",
-        "_delete_recordings: size = select(func.coalesce(func.sum(StoredRecording.size_bytes), 1))"
-        ".where(StoredRecording.row.in_(rows))",
+        "_delete_recordings: size = select(func.coalesce(func.sum(of.size_bytes), 1)).where(of.row.in_(rows))",
     ): "of no recording; 1 is no more than AT_ONCE_BYTES either, and there is nothing to delete",
     (
         "skills/verification/gates.py",

@@ -52,7 +52,7 @@ NOTED = {  # by logged table, its key, and the columns that may change: a note n
     "calibrations": (("row",), ""),
     "erasures": (("row",), ""),
     "events": (("row",), ""),
-    "keys": (("row",), "row id digest owner role restricted created_at created_by expires_at revoked_at"),
+    "keys": (("row",), "row id digest owner role restricted created_by expires_at revoked_at created_at"),
     "recordings": (("row",), ""),
     "surgeons": (("row",), "row slug subject skill_level handedness protocol consent created_at"),
     "suture_types": (("slug",), "slug name also_called family description"),
@@ -60,7 +60,7 @@ NOTED = {  # by logged table, its key, and the columns that may change: a note n
     "erased_intervals": (("row",), ""),
     "jobs": (
         ("row",),
-        "row id kind identity state request result error surgeon_row plan requested_by created_at ended_at",
+        "row id kind identity state request result error surgeon_row plan requested_by ended_at created_at",
     ),
     "key_surgeons": (("key_row", "surgeon_row"), "key_row surgeon_row"),
     "parsed_recordings": (("recording_row",), "recording_row version reading sha256"),
@@ -147,7 +147,7 @@ def upgrade() -> None:
         sa.UniqueConstraint("number", name="uq_history_number"),
         sqlite_autoincrement=True,
     )
-    op.create_index("ix_history_key", "history", ["table_name", "key"])
+    op.create_index("ix_history_key", "history", ["table_name", "key", "row"])
     op.create_index(
         "ix_history_unsigned",
         "history",

@@ -1,6 +1,7 @@
 """The database: tables whose rows label values, sessions and transactions, serialisation, and backups.
 
-Here are the definitions that all tables share: names of constraints, UTC timestamps, digests, row numbers.
+Here are the definitions that all tables share: names of constraints, UTC timestamps, digests, row numbers, and the
+query of the newest rows.
 
 models           the tables of the library
 service_tables   the tables of the service: jobs, workers, keys, sign-ins, the audit log
@@ -20,8 +21,8 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, TypeVar
 
+import sqlalchemy as sa
 from pydantic import TypeAdapter, ValidationError
-from sqlalchemy import BigInteger, DateTime, Dialect, Index, Integer, MetaData, String, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 from sqlalchemy.sql.operators import OperatorType
 from sqlalchemy.types import JSON, TypeDecorator, TypeEngine
@@ -29,6 +30,7 @@ from sqlalchemy.types import JSON, TypeDecorator, TypeEngine
 from skills.errors import Corrupt
 
 T = TypeVar("T")
+N = TypeVar("N", bound="Numbered")
 
 NAMES = {
     "ix": "ix_%(column_0_label)s",
@@ -38,7 +40,14 @@ NAMES = {
     "pk": "pk_%(table_name)s",
 }
 
+Sha256 = sa.String(64)
+Slug = sa.String(64)
 PARAMETERS = 10_000  # ours: per statement, well below the limit of either database
+
+
+def now() -> datetime:
+    """Return the current time in UTC."""
+    return datetime.now(UTC)
 
 
 class Moment(TypeDecorator[datetime]):
@@ -47,17 +56,17 @@ class Moment(TypeDecorator[datetime]):
     A timestamp without time zone is a programming error, which is asserted: SQLite would store it unchecked.
     """
 
-    impl = DateTime(timezone=True)
+    impl = sa.DateTime(timezone=True)
     cache_ok = True
 
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+    def process_bind_param(self, value: datetime | None, dialect: sa.Dialect) -> datetime | None:
         """Convert to UTC before storing."""
         if value is None:
             return None
         assert value.tzinfo is not None, "times must have a time zone"
         return value.astimezone(UTC)
 
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+    def process_result_value(self, value: datetime | None, dialect: sa.Dialect) -> datetime | None:
         """Return the timestamp in UTC; SQLite returns it without its time zone."""
         return value if value is None else value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
@@ -77,11 +86,11 @@ class AsJson(TypeDecorator[T], Generic[T]):
         self.kind = kind
         self._adapter = TypeAdapter(kind)
 
-    def process_bind_param(self, value: T | None, dialect: Dialect) -> Any:
+    def process_bind_param(self, value: T | None, dialect: sa.Dialect) -> Any:
         """Return plain JSON."""
         return None if value is None else self._adapter.dump_python(value, mode="json")
 
-    def process_result_value(self, value: Any, dialect: Dialect) -> T | None:
+    def process_result_value(self, value: Any, dialect: sa.Dialect) -> T | None:
         """Return the value.
 
         Raises:
@@ -100,19 +109,19 @@ class AsJson(TypeDecorator[T], Generic[T]):
 class Base(DeclarativeBase):
     """The declarative base class of all tables."""
 
-    metadata = MetaData(naming_convention=NAMES)
+    metadata = sa.MetaData(naming_convention=NAMES)
     type_annotation_map = {  # noqa: RUF012 - SQLAlchemy reads it from the class
         datetime: Moment,
         dict[str, Any]: JSON,
         list[Any]: JSON,
-        str: String(200),
+        str: sa.String(200),
     }
 
 
-RowId = Annotated[
-    int,
-    mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True, sort_order=-1),
-]
+# Columns stand in the order row, digest, those of the table, and time of creation, whatever class declares them.
+ROW = sa.BigInteger().with_variant(sa.Integer, "sqlite")
+RowId = Annotated[int, mapped_column(ROW, primary_key=True, autoincrement=True, sort_order=-2)]
+Number = Annotated[int, mapped_column(ROW)]  # a row, without a foreign key
 
 
 class Numbered(Base):
@@ -123,28 +132,41 @@ class Numbered(Base):
     row: Mapped[RowId]
 
 
-Number = Annotated[int, mapped_column(BigInteger().with_variant(Integer, "sqlite"))]  # a row, without a foreign key
-Sha256 = String(64)
-Slug = String(64)
+def newest(of: type[N], *which: sa.ColumnElement[bool], limit: int = 1, before: int | None = None) -> sa.Select[N]:
+    """Return the query of the newest rows that meet some conditions, the newest first: those before a row, if given."""
+    query = sa.select(of).where(*which).order_by(of.row.desc()).limit(limit)
+    return query if before is None else query.where(of.row < before)
 
 
-def partial_index(name: str, *columns: str, where: str, unique: bool = False) -> Index:
+class Dated(Numbered):
+    """The base class of tables whose rows have the time of their creation."""
+
+    __abstract__ = True
+
+    created_at: Mapped[datetime] = mapped_column(default=now, sort_order=1)
+
+
+class Identified(Dated):
+    """The base class of tables whose rows are identified by a SHA-256 in hex, of the value that they label."""
+
+    __abstract__ = True
+
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True, sort_order=-1)
+
+
+def partial_index(name: str, *columns: str, where: str, unique: bool = False) -> sa.Index:
     """Return an index of the rows that meet a condition, on either database."""
-    return Index(name, *columns, unique=unique, sqlite_where=text(where), postgresql_where=text(where))
+    return sa.Index(name, *columns, unique=unique, sqlite_where=sa.text(where), postgresql_where=sa.text(where))
 
 
-def in_parts(rows: Sequence[int]) -> Iterator[Sequence[int]]:
-    """Split row numbers into batches of at most `PARAMETERS` for `IN` clauses.
+def in_parts(values: Sequence[T], most: int | None = None) -> Iterator[Sequence[T]]:
+    """Split values into batches, by default for `IN` clauses.
 
     A statement has at most 32,766 parameters on SQLite and 65,535 on PostgreSQL.
     """
-    for at in range(0, len(rows), PARAMETERS):
-        yield rows[at : at + PARAMETERS]
-
-
-def now() -> datetime:
-    """Return the current time in UTC."""
-    return datetime.now(UTC)
+    step = most or PARAMETERS
+    for at in range(0, len(values), step):
+        yield values[at : at + step]
 
 
 def rfc3339(moment: datetime | None) -> str | None:

@@ -70,7 +70,7 @@ class Changes:
         """Return the version of the served policies; None where it is unknown."""
         return None
 
-    def first(self, _question: Select[*tuple[Any, ...]], _values: dict[str, Any]) -> tuple[Any, ...] | None:
+    def first(self, _question: Select[*tuple[Any, ...]], _values: dict[str, object]) -> tuple[Any, ...] | None:
         """Query one row by an index on the event loop, where that takes microseconds.
 
         Raises:
@@ -114,12 +114,12 @@ class InFile(Changes):
             return None
         return int(version)
 
-    def first(self, question: Select[*tuple[Any, ...]], values: dict[str, Any]) -> tuple[Any, ...] | None:
+    def first(self, question: Select[*tuple[Any, ...]], values: dict[str, object]) -> tuple[Any, ...] | None:
         """Run the query at once: in WAL mode a reader never waits for a writer."""
         statement, given = _in_sqlite(question)
         return next(iter(self._ask(statement, given | values)), None)
 
-    def _ask(self, statement: str, values: dict[str, Any] | tuple[()] = ()) -> list[tuple[Any, ...]]:
+    def _ask(self, statement: str, values: dict[str, object] | tuple[()] = ()) -> list[tuple[Any, ...]]:
         if self._cursor is None:
             raise Unasked
         try:
@@ -129,7 +129,7 @@ class InFile(Changes):
 
 
 @cache
-def _in_sqlite(question: Select[*tuple[Any, ...]]) -> tuple[str, dict[str, Any]]:
+def _in_sqlite(question: Select[*tuple[Any, ...]]) -> tuple[str, dict[str, object]]:
     """Compile a query for SQLite, and return it with its bound values."""
     from sqlalchemy.dialects import sqlite
 

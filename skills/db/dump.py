@@ -18,10 +18,10 @@ from typing import IO, Any, Final, Literal
 from zipfile import ZIP_STORED, ZipFile
 
 from pydantic import BaseModel
-from sqlalchemy import Column, Connection, MetaData, Table, insert, select, text
+from sqlalchemy import Connection, Table, insert, select, text
 
 from skills.db import Base, now, rfc3339
-from skills.db.logged_rows import KINDS, kind_of
+from skills.db.logged_rows import kind_of, raw_table
 from skills.db.models import ParsedChunk, ParsedRecording
 from skills.db.revisions import revision_of, revisions, upgrade
 from skills.db.service_tables import Executor, SignIn
@@ -68,11 +68,6 @@ class Manifest(BaseModel):
 def member_of(table: str) -> str:
     """Return the name of a table's file in the archive."""
     return f"{table}.rows"
-
-
-def raw_table(name: str, columns: Sequence[tuple[str, str]]) -> Table:
-    """Return a table with raw columns: serialised values stay bytes."""
-    return Table(name, MetaData(), *(Column(column, KINDS[kind]) for column, kind in columns))
 
 
 def tables() -> list[Table]:
@@ -202,8 +197,8 @@ def load(file: IO[bytes], manifest: Manifest, connection: Connection, progress: 
     upgrade(connection)
 
 
-def _batches(file: IO[bytes], dumped: Dumped) -> Iterator[list[dict[str, Any]]]:
-    batch: list[dict[str, Any]] = []
+def _batches(file: IO[bytes], dumped: Dumped) -> Iterator[list[dict[str, object]]]:
+    batch: list[dict[str, object]] = []
     held = 0
     for line in iter(file.readline, b""):
         row = {}

@@ -161,7 +161,7 @@ def _is_anothers(file: Path) -> bool:
     return False
 
 
-def _pool(patience_ms: int) -> dict[str, Any]:
+def _pool(patience_ms: int) -> dict[str, float]:
     """Return the engine's options for the size of the connection pool and the timeout for a connection."""
     return {"pool_size": KEPT_OPEN, "max_overflow": AT_ONCE - KEPT_OPEN, "pool_timeout": patience_ms / 1000}
 

@@ -201,7 +201,7 @@ class History:
         connection.info[NOTING] = True
         if not inspect(connection).has_table(LEAVES.name) or self.origin(connection) is not None:
             return
-        if any(True for table in logged().values() for _ in table.pages(connection)):
+        if any(connection.execute(table.in_order.limit(1)).first() for table in logged().values()):
             self._why = REMOVED
             raise NotReady(*REMOVED)
         self.sign_empty(connection)

@@ -16,10 +16,10 @@ from functools import cached_property
 from typing import Any, NamedTuple, cast
 
 import orjson
-from sqlalchemy import JSON, BigInteger, Connection, Index, LargeBinary, String, Table, insert, select, update
+from sqlalchemy import JSON, BigInteger, Connection, Index, LargeBinary, String, Table, func, insert, select, update
 from sqlalchemy.orm import Mapped, mapped_column
 
-from skills.db import Numbered, now, partial_index
+from skills.db import Numbered, in_parts, now, partial_index
 from skills.db.change_notes import ADD, CHANGE, REMOVE, Effect
 from skills.db.logged_rows import ADDED, CACHES, ROWS_AT_ONCE, commitment_to, compact, digests_of, logged
 from skills.transparency.merkle import leaf_hash
@@ -45,7 +45,7 @@ class Leaf(Numbered):
     digests: Mapped[dict[str, str] | None] = mapped_column(JSON(none_as_null=True))
 
     __table_args__ = (
-        Index("ix_history_key", "table_name", "key"),
+        Index("ix_history_key", "table_name", "key", "row"),
         partial_index("ix_history_unsigned", "row", where="number IS NULL"),
     )
 
@@ -85,6 +85,10 @@ class Latest:
     number: int | None = None
     seal: bytes = b""
 
+    @cached_property
+    def _logged(self) -> Any:
+        return orjson.loads(self.entry)
+
     @property
     def hash(self) -> str:
         """The hash of its entry, by which the row's next leaf names it."""
@@ -93,12 +97,12 @@ class Latest:
     @property
     def is_committed(self) -> bool:
         """Whether its digests are those that were logged, and of the same columns."""
-        return bool(orjson.loads(self.entry)["commitment"] == commitment_to(self.digests))
+        return bool(self._logged["commitment"] == commitment_to(self.digests))
 
     @cached_property
     def of_row(self) -> Mapping[str, str]:
         """The digests of all columns: one that was added after the leaf has the value that its migration gave it."""
-        added = ADDED.get(orjson.loads(self.entry)["table"], {})
+        added = ADDED.get(self._logged["table"], {})
         return {**digests_of(tuple(added), tuple(added.values()), self.salt), **self.digests}
 
     def digests_of(self, names: Iterable[str], row: Any) -> dict[str, str]:
@@ -118,16 +122,13 @@ class Latest:
 
 def latest_leaves(connection: Connection, table: str, keys: Sequence[str] | None = None) -> dict[str, Latest]:
     """Return the newest leaves of some rows that exist, or of all rows of a table, by key."""
-    columns = (LEAVES.c.key, LEAVES.c.row, LEAVES.c.entry, LEAVES.c.salt, LEAVES.c.digests)
-    of_table = (LEAVES.c.table_name == table, LEAVES.c.key.is_not(None))
-    query = select(*columns, LEAVES.c.number, LEAVES.c.seal).where(*of_table).order_by(LEAVES.c.row)
-    if keys is None:
-        return {key: Latest(*leaf) for key, *leaf in connection.execute(query)}
-    found = {}
-    for at in range(0, len(keys), ROWS_AT_ONCE):
-        these = query.where(LEAVES.c.key.in_(keys[at : at + ROWS_AT_ONCE]))
-        found.update({key: Latest(*leaf) for key, *leaf in connection.execute(these)})
-    return found
+    of = LEAVES.c
+    # The newest of each row alone, because a row that changes often has very many.
+    newest = select(func.max(of.row)).where(of.table_name == table, of.key.is_not(None)).group_by(of.key)
+    parts = [newest] if keys is None else [newest.where(of.key.in_(some)) for some in in_parts(keys, ROWS_AT_ONCE)]
+    query = select(of.key, of.row, of.entry, of.salt, of.digests, of.number, of.seal)
+    found = (leaf for part in parts for leaf in connection.execute(query.where(of.row.in_(part))))
+    return {key: Latest(*leaf) for key, *leaf in found}
 
 
 # ---- writing leaves --------------------------------------------------------------------------------------------------
@@ -148,17 +149,12 @@ def new_leaf(
 ) -> NewLeaf:
     """Return a leaf for a row with these logged columns, which follows the row's leaf before."""
     salt = secrets.token_bytes(SALT_BYTES)
-    return _leaf(table, change, at, key, salt, digests_of(columns, columns.values(), salt), after)
+    digests = digests_of(columns, columns.values(), salt)
+    return NewLeaf(table, key, _entry(table, change, at, digests, after), salt, digests)
 
 
-def _leaf(
-    table: str, change: str, at: str | None, key: str, salt: bytes, digests: dict[str, str], after: Latest | None
-) -> NewLeaf:
-    entry = _entry(table, change, at, commitment_to(digests), after)
-    return NewLeaf(table, key, entry, salt, digests)
-
-
-def _entry(table: str, change: str, at: str | None, commitment: str | None, after: Latest | None) -> str:
+def _entry(table: str, change: str, at: str | None, digests: dict[str, str] | None, after: Latest | None) -> str:
+    commitment = None if digests is None else commitment_to(digests)
     previous = None if after is None else after.hash
     return compact({"table": table, "change": change, "at": at, "commitment": commitment, "previous": previous})
 
@@ -181,7 +177,7 @@ def leaves_of_changes(
         elif before is not None and effect.changed and before.is_committed:
             # the other columns keep their digests: if somebody else has changed one, that stays to be found
             digests = {**before.of_row, **before.digests_of(effect.changed, row)}
-            yield _leaf(table, CHANGE, at, key, before.salt, digests, before)
+            yield NewLeaf(table, key, _entry(table, CHANGE, at, digests, before), before.salt, digests)
         # a row without a leaf, or with one that was changed, is not the service's: `skills verify` goes on naming it
     gone = [key for key, effect in effects.items() if effect.before and not effect.after]
     yield from removals(connection, table, gone, latest, at)
@@ -192,8 +188,8 @@ def removals(
 ) -> Iterator[NewLeaf]:
     """Yield a leaf for each removed row, and remove what the row's earlier leaves reveal about it."""
     known = [key for key in keys if key in latest]
-    for first in range(0, len(known), ROWS_AT_ONCE):
-        theirs = (LEAVES.c.table_name == table, LEAVES.c.key.in_(known[first : first + ROWS_AT_ONCE]))
+    for some in in_parts(known, ROWS_AT_ONCE):
+        theirs = (LEAVES.c.table_name == table, LEAVES.c.key.in_(some))
         connection.execute(update(LEAVES).where(*theirs).values(salt=None, digests=None, key=None))
     for key in known:
         yield NewLeaf(table, None, _entry(table, REMOVE, at, None, latest[key]))

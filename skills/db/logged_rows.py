@@ -15,27 +15,10 @@ from json.encoder import encode_basestring_ascii
 from typing import Any
 
 import orjson
-from sqlalchemy import (
-    JSON,
-    BigInteger,
-    Boolean,
-    Column,
-    ColumnElement,
-    Connection,
-    Double,
-    Float,
-    Integer,
-    LargeBinary,
-    MetaData,
-    String,
-    Table,
-    select,
-    text,
-    tuple_,
-)
+import sqlalchemy as sa
 from sqlalchemy.types import NullType, TypeEngine
 
-from skills.db import AsJson, Base, Moment
+from skills.db import AsJson, Base, Moment, in_parts
 from skills.db.packed import Packed
 from skills.packing import sha256
 
@@ -68,36 +51,42 @@ COLUMNS_NOT_LOGGED = {
 }
 # By table, the columns that a migration has added to it, each with its value in the rows that there were. The leaves of
 # these rows lack the columns; every later leaf has them.
-ADDED: dict[str, dict[str, Any]] = {}
+ADDED: dict[str, dict[str, object]] = {}
 
 # ---- rows as they are stored -----------------------------------------------------------------------------------------
 
 KINDS: dict[str, TypeEngine[Any]] = {
-    "bytes": LargeBinary(),
-    "json": JSON(none_as_null=True),
+    "bytes": sa.LargeBinary(),
+    "json": sa.JSON(none_as_null=True),
     "moment": Moment(),
-    "truth": Boolean(),
+    "truth": sa.Boolean(),
     "plain": NullType(),  # text and numbers, which all drivers and JSON represent alike
 }
-PLAIN = (String, Integer, BigInteger, Float, Double)
+PLAIN = (sa.String, sa.Integer, sa.BigInteger, sa.Float, sa.Double)
 
 
-def kind_of(column: Column[Any]) -> str:
+def kind_of(column: sa.Column[Any]) -> str:
     """Return the kind of a column, a key of `KINDS`, which decides how its values are represented elsewhere."""
-    if isinstance(column.type, Packed | LargeBinary):
+    if isinstance(column.type, Packed | sa.LargeBinary):
         return "bytes"
-    for kind, types in (("json", JSON | AsJson), ("moment", Moment), ("truth", Boolean), ("plain", PLAIN)):
+    for kind, types in (("json", sa.JSON | AsJson), ("moment", Moment), ("truth", sa.Boolean), ("plain", PLAIN)):
         if isinstance(column.type, types):
             return kind
     raise AssertionError(f"no raw form of {column}")
+
+
+def raw_table(name: str, columns: Iterable[tuple[str, str]]) -> sa.Table:
+    """Return a table with raw columns, given by name and kind: serialised values stay bytes."""
+    return sa.Table(name, sa.MetaData(), *(sa.Column(column, KINDS[kind]) for column, kind in columns))
 
 
 @dataclass(frozen=True)
 class Logged:
     """A logged table with raw columns: serialised values stay bytes."""
 
-    raw: Table
+    raw: sa.Table
     keys: tuple[str, ...]
+    of_text: bool  # whether keys are texts
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
@@ -105,46 +94,26 @@ class Logged:
         return tuple(str(column.name) for column in self.raw.columns)
 
     @cached_property
-    def key_columns(self) -> list[Column[Any]]:
+    def key_columns(self) -> list[sa.Column[Any]]:
         """The columns of the primary key."""
         return [self.raw.c[name] for name in self.keys]
-
-    @property
-    def _mapped(self) -> Table:
-        return Base.metadata.tables[self.raw.name]
 
     def key_of(self, row: Any) -> str:
         """Return the key of a row as text."""
         return "/".join(str(getattr(row, name)) for name in self.keys)
 
-    def firsts_of(self, keys: Iterable[str]) -> list[Any]:
-        """Return the values with which some keys begin; few other rows share them, and all indexes begin with them."""
-        return sorted({key if self.of_text else int(key.partition("/")[0]) for key in keys})
-
-    @cached_property
-    def of_text(self) -> bool:
-        """Whether keys are texts."""
-        return isinstance(self._mapped.c[self.keys[0]].type, String)
-
-    def rows_of(self, connection: Connection, keys: Sequence[str]) -> Iterator[Any]:
+    def rows_of(self, connection: sa.Connection, keys: Sequence[str]) -> Iterator[Any]:
         """Yield the rows with some keys, of those that exist."""
-        for at in range(0, len(keys), ROWS_AT_ONCE):
-            some = frozenset(keys[at : at + ROWS_AT_ONCE])
-            rows = connection.execute(select(self.raw).where(self.key_columns[0].in_(self.firsts_of(some))))
+        for some in map(frozenset, in_parts(keys, ROWS_AT_ONCE)):
+            # By the values with which the keys begin: few other rows share them, and all indexes begin with them.
+            firsts = sorted({key if self.of_text else int(key.partition("/")[0]) for key in some})
+            rows = connection.execute(sa.select(self.raw).where(self.key_columns[0].in_(firsts)))
             yield from (row for row in rows if self.key_of(row) in some)
 
-    def after(self, key: Sequence[Any]) -> ColumnElement[bool]:
-        """Return the condition of the rows whose keys come after a key, given as its values."""
-        return tuple_(*self.key_columns) > tuple_(*key)
-
-    def pages(self, connection: Connection) -> Iterator[list[Any]]:
-        """Yield all rows in the order of their keys, some at a time."""
-        query = select(self.raw).order_by(*self.key_columns).limit(ROWS_AT_ONCE)
-        page = list(connection.execute(query))
-        while page:
-            yield page
-            last = [getattr(page[-1], name) for name in self.keys]
-            page = list(connection.execute(query.where(self.after(last))))
+    @cached_property
+    def in_order(self) -> sa.Select[Any]:
+        """The query of all rows, in the order of their keys."""
+        return sa.select(self.raw).order_by(*self.key_columns)
 
 
 @cache
@@ -153,10 +122,10 @@ def logged() -> Mapping[str, Logged]:
     return {table.name: _logged(table) for table in Base.metadata.sorted_tables if table.name not in NOT_LOGGED}
 
 
-def _logged(table: Table) -> Logged:
-    columns = [one for one in table.columns if (table.name, one.name) not in COLUMNS_NOT_LOGGED]
-    raw = Table(table.name, MetaData(), *(Column(one.name, KINDS[kind_of(one)]) for one in columns))
-    return Logged(raw, tuple(one.name for one in table.primary_key))
+def _logged(table: sa.Table) -> Logged:
+    columns = [(one.name, kind_of(one)) for one in table.columns if (table.name, one.name) not in COLUMNS_NOT_LOGGED]
+    keys = list(table.primary_key)
+    return Logged(raw_table(table.name, columns), tuple(key.name for key in keys), isinstance(keys[0].type, sa.String))
 
 
 # ---- digests of rows ------------------------------------------------------------------------------------------------
@@ -232,14 +201,14 @@ _COPIED = re.compile(r"ANY \(ARRAY\[((?:\('(?:[^']|'')*'::character varying\)::t
 _ONE = re.compile(r"\(('(?:[^']|'')*'::character varying)\)::text")
 
 
-def schema_of(connection: Connection) -> dict[str, str]:
+def schema_of(connection: sa.Connection) -> dict[str, str]:
     """Return the definitions of triggers, functions, constraints, indexes and tables, by kind and name.
 
     They are the same for a database that was copied by `pg_dump`, also to another major version of PostgreSQL.
     """
     kind = connection.dialect.name
     given = {"tables": list(Base.metadata.tables)} if kind == "postgresql" else {}
-    return {name: _as_migrated(sql) for name, sql in connection.execute(text(_OBJECTS[kind]), given)}
+    return {name: _as_migrated(sql) for name, sql in connection.execute(sa.text(_OBJECTS[kind]), given)}
 
 
 def _as_migrated(sql: str) -> str:

@@ -11,25 +11,12 @@ once. Only erasure deletes. The tables of the service's own state are in `skills
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import (
-    BigInteger,
-    CheckConstraint,
-    ColumnElement,
-    ForeignKey,
-    Index,
-    LargeBinary,
-    ScalarSelect,
-    String,
-    UniqueConstraint,
-    and_,
-    func,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from skills.comparison.distances import Measured
-from skills.db import AsJson, Base, Number, Numbered, RowId, Sha256, Slug, now, partial_index
+from skills.db import AsJson, Base, Dated, Identified, Number, Numbered, RowId, Sha256, Slug, now, partial_index
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import Pause
@@ -66,18 +53,17 @@ stored(Trajectory, OtherArm, Poses)
 store_as_palette(Coverage, "share")  # one for each waypoint
 
 
-class Surgeon(Numbered):
+class Surgeon(Dated):
     """A surgeon, identified by a pseudonym; `subject` is the random name in events, which erasure deletes."""
 
     __tablename__ = "surgeons"
 
     slug: Mapped[str] = mapped_column(Slug, unique=True)
-    subject: Mapped[str] = mapped_column(String(32), unique=True)
+    subject: Mapped[str] = mapped_column(sa.String(32), unique=True)
     skill_level: Mapped[str | None]
     handedness: Mapped[str | None]
     protocol: Mapped[str | None]
     consent: Mapped[Consent | None] = mapped_column(AsJson(Consent))
-    created_at: Mapped[datetime] = mapped_column(default=now)
 
 
 class LastUsed(Numbered):
@@ -85,7 +71,7 @@ class LastUsed(Numbered):
 
     __tablename__ = "used_numbers"
 
-    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row", ondelete="CASCADE"), index=True)
+    surgeon_row: Mapped[int] = mapped_column(sa.ForeignKey("surgeons.row", ondelete="CASCADE"), index=True)
     suture: Mapped[str] = mapped_column(Slug)  # not of the catalogue alone: a restored one may be older
     last: Mapped[int]
 
@@ -95,7 +81,7 @@ class Erasure(Numbered):
 
     __tablename__ = "erasures"
 
-    salt: Mapped[str] = mapped_column(String(64))
+    salt: Mapped[str] = mapped_column(sa.String(64))
     digest: Mapped[str] = mapped_column(Sha256)
     erased_at: Mapped[datetime] = mapped_column(default=now)
 
@@ -109,22 +95,20 @@ class SutureType(Base):
     name: Mapped[str]
     also_called: Mapped[list[str]] = mapped_column(AsJson(list[str]))
     family: Mapped[str]
-    description: Mapped[str] = mapped_column(String(2000))
+    description: Mapped[str] = mapped_column(sa.String(2000))
 
 
-class StoredRecording(Numbered):
+class StoredRecording(Identified):
     """An uploaded file, identified by the SHA-256 of its bytes."""
 
     __tablename__ = "recordings"
 
-    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
-    size_bytes: Mapped[int] = mapped_column(BigInteger)
+    size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
     media_type: Mapped[str]
     format: Mapped[str]
     integrity: Mapped[str]
     reading: Mapped[TableIn] = mapped_column(AsJson(TableIn))
     about: Mapped[RecordingContent] = mapped_column(AsJson(RecordingContent))
-    created_at: Mapped[datetime] = mapped_column(default=now)
 
 
 class RecordingUpload(Base):
@@ -132,7 +116,7 @@ class RecordingUpload(Base):
 
     __tablename__ = "recording_uploads"
 
-    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
+    recording_row: Mapped[int] = mapped_column(sa.ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
     actor: Mapped[str] = mapped_column(primary_key=True)
 
 
@@ -141,8 +125,8 @@ class RecordingSurgeon(Base):
 
     __tablename__ = "recording_surgeons"
 
-    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
-    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"), primary_key=True, index=True)
+    recording_row: Mapped[int] = mapped_column(sa.ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
+    surgeon_row: Mapped[int] = mapped_column(sa.ForeignKey("surgeons.row"), primary_key=True, index=True)
 
 
 class ErasedInterval(Numbered):
@@ -153,8 +137,8 @@ class ErasedInterval(Numbered):
 
     __tablename__ = "erased_intervals"
 
-    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), index=True)
-    surgeon_row: Mapped[int | None] = mapped_column(ForeignKey("surgeons.row"), index=True)
+    recording_row: Mapped[int] = mapped_column(sa.ForeignKey("recordings.row", ondelete="CASCADE"), index=True)
+    surgeon_row: Mapped[int | None] = mapped_column(sa.ForeignKey("surgeons.row"), index=True)
     start_s: Mapped[float | None]
     end_s: Mapped[float | None]
 
@@ -171,7 +155,7 @@ class RecordingChunk(Base):
 
     recording: Mapped[Number] = mapped_column(primary_key=True, autoincrement=False)
     number: Mapped[int] = mapped_column(primary_key=True)
-    data: Mapped[bytes] = mapped_column(LargeBinary)
+    data: Mapped[bytes] = mapped_column(sa.LargeBinary)
 
 
 class LooseChunks(Base):
@@ -192,7 +176,7 @@ class ParsedRecording(Base):
 
     __tablename__ = "parsed_recordings"
 
-    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
+    recording_row: Mapped[int] = mapped_column(sa.ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
     version: Mapped[int]
     reading: Mapped[str] = mapped_column(Sha256)  # digest of the reading parameters
     sha256: Mapped[str] = mapped_column(Sha256)  # of the recording's digest, the two above and the chunks
@@ -204,13 +188,13 @@ class ParsedChunk(Base):
     __tablename__ = "parsed_chunks"
 
     recording_row: Mapped[int] = mapped_column(
-        ForeignKey("parsed_recordings.recording_row", ondelete="CASCADE"), primary_key=True
+        sa.ForeignKey("parsed_recordings.recording_row", ondelete="CASCADE"), primary_key=True
     )
     number: Mapped[int] = mapped_column(primary_key=True)
-    data: Mapped[bytes] = mapped_column(LargeBinary)
+    data: Mapped[bytes] = mapped_column(sa.LargeBinary)
 
 
-class ProposalMark(Numbered):
+class ProposalMark(Dated):
     """A decision on a proposed hand-off of a recording, with a note: rejected, or open again. The newest one counts.
 
     `number` is that of the proposal in `StoredRecording.about`, counted from 1. An accepted proposal has no mark: its
@@ -219,61 +203,58 @@ class ProposalMark(Numbered):
 
     __tablename__ = "proposal_marks"
 
-    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"))
+    recording_row: Mapped[int] = mapped_column(sa.ForeignKey("recordings.row", ondelete="CASCADE"))
     number: Mapped[int]
     state: Mapped[str]
     note: Mapped[str | None]
     actor: Mapped[str]
-    created_at: Mapped[datetime] = mapped_column(default=now)
 
     __table_args__ = (
-        CheckConstraint("state IN ('open', 'rejected')", name="state"),
-        Index("ix_proposal_marks_newest", "recording_row", "number", "row"),
+        sa.CheckConstraint("state IN ('open', 'rejected')", name="state"),
+        sa.Index("ix_proposal_marks_newest", "recording_row", "number", "row"),
     )
 
 
 SUCCESS = "success"
 
 
-class DemonstrationOutcome(Numbered):
+class DemonstrationOutcome(Dated):
     """A mark of a demonstration: success, recovery or failure, with the reason. The newest mark counts."""
 
     __tablename__ = "demonstration_outcomes"
 
-    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"))
+    demonstration_row: Mapped[int] = mapped_column(sa.ForeignKey("demonstrations.row"))
     outcome: Mapped[str]
     reason: Mapped[str | None]
     actor: Mapped[str]
-    created_at: Mapped[datetime] = mapped_column(default=now)
 
     __table_args__ = (
-        CheckConstraint("outcome IN ('success', 'recovery', 'failure')", name="outcome"),
-        Index("ix_demonstration_outcomes_newest", "demonstration_row", "row"),
-        Index("ix_demonstration_outcomes_outcome", "outcome", "demonstration_row"),
+        sa.CheckConstraint("outcome IN ('success', 'recovery', 'failure')", name="outcome"),
+        sa.Index("ix_demonstration_outcomes_newest", "demonstration_row", "row"),
+        sa.Index("ix_demonstration_outcomes_outcome", "outcome", "demonstration_row"),
     )
 
 
-def newest_mark(column: str, demonstration_row: Any) -> ScalarSelect[str | None]:
+def newest_mark(column: str, demonstration_row: Any) -> sa.ScalarSelect[str | None]:
     """Return a subquery of a column of a demonstration's newest mark; null if it was never marked.
 
     It is of the bare table, to which no rule of `skills.db.row_visibility` is added: a mark is visible with its
     demonstration.
     """
     marks = DemonstrationOutcome.__table__
-    newest = select(marks.c[column]).where(marks.c.demonstration_row == demonstration_row)
+    newest = sa.select(marks.c[column]).where(marks.c.demonstration_row == demonstration_row)
     return newest.order_by(marks.c.row.desc()).limit(1).correlate_except(marks).scalar_subquery()
 
 
-class Demonstration(Base):
+class Demonstration(Identified):
     """One hand-off segment cut from a recording, with its path in a grid world; `outcome` is None if not known."""
 
     __tablename__ = "demonstrations"
 
-    row: Mapped[RowId] = mapped_column()
-    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
-    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row"), index=True)
-    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
-    suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
+    row: Mapped[RowId] = mapped_column(sort_order=-2)
+    recording_row: Mapped[int] = mapped_column(sa.ForeignKey("recordings.row"), index=True)
+    surgeon_row: Mapped[int] = mapped_column(sa.ForeignKey("surgeons.row"))
+    suture: Mapped[str] = mapped_column(sa.ForeignKey("suture_types.slug"))
     arm: Mapped[str]
     topic: Mapped[str]
     frame: Mapped[str]
@@ -286,7 +267,6 @@ class Demonstration(Base):
     path: Mapped[GridPath] = mapped_column(Packed(GridPath), deferred=True)
     report: Mapped[DemoReport] = mapped_column(AsJson(DemoReport))
     segment: Mapped[ChosenSegment] = mapped_column(AsJson(ChosenSegment))
-    created_at: Mapped[datetime] = mapped_column(default=now)
     withdrawn_at: Mapped[datetime | None]
     outcome: Mapped[DemoOutcome | None] = column_property(newest_mark("outcome", row))
     outcome_reason: Mapped[str | None] = column_property(newest_mark("reason", row))
@@ -294,9 +274,9 @@ class Demonstration(Base):
     recording: Mapped[StoredRecording] = relationship(lazy="joined", innerjoin=True)
     surgeon: Mapped[Surgeon] = relationship(lazy="joined", innerjoin=True)
     __table_args__ = (
-        Index("ix_demonstrations_style", "surgeon_row", "suture", "row"),
-        Index("ix_demonstrations_surgeon", "surgeon_row", "row"),
-        Index("ix_demonstrations_suture", "suture", "row"),
+        sa.Index("ix_demonstrations_style", "surgeon_row", "suture", "row"),
+        sa.Index("ix_demonstrations_surgeon", "surgeon_row", "row"),
+        sa.Index("ix_demonstrations_suture", "suture", "row"),
         partial_index("ix_demonstrations_withdrawn", "row", where="withdrawn_at IS NOT NULL"),
     )
 
@@ -317,8 +297,8 @@ class Demonstration(Base):
 
     @learnable.inplace.expression
     @classmethod
-    def _learnable(cls) -> ColumnElement[bool]:
-        return and_(cls.withdrawn_at.is_(None), func.coalesce(cls.outcome, SUCCESS) == SUCCESS)
+    def _learnable(cls) -> sa.ColumnElement[bool]:
+        return sa.and_(cls.withdrawn_at.is_(None), sa.func.coalesce(cls.outcome, SUCCESS) == SUCCESS)
 
 
 class MeasuredShape(Base):
@@ -331,7 +311,7 @@ class MeasuredShape(Base):
 
     __tablename__ = "measured_shapes"
 
-    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), primary_key=True)
+    demonstration_row: Mapped[int] = mapped_column(sa.ForeignKey("demonstrations.row"), primary_key=True)
     version: Mapped[int]
     measured: Mapped[Measured] = mapped_column(Packed(Measured))
 
@@ -342,32 +322,30 @@ class StoredRewardMap(Numbered):
     __tablename__ = "reward_maps"
 
     sha256: Mapped[str] = mapped_column(Sha256)
-    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), unique=True)
+    demonstration_row: Mapped[int] = mapped_column(sa.ForeignKey("demonstrations.row"), unique=True)
     map: Mapped[RewardMap] = mapped_column(Packed(RewardMap), deferred=True)
 
 
-class PolicyVersion(Numbered):
+class PolicyVersion(Identified):
     """One learnt policy of a style; `manifest` is its description for clients, without the release."""
 
     __tablename__ = "policy_versions"
 
-    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     training: Mapped[str] = mapped_column(Sha256, index=True)  # identity of the training that produced it
-    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
-    suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
+    surgeon_row: Mapped[int] = mapped_column(sa.ForeignKey("surgeons.row"))
+    suture: Mapped[str] = mapped_column(sa.ForeignKey("suture_types.slug"))
     version: Mapped[int]
-    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), index=True)
+    demonstration_row: Mapped[int] = mapped_column(sa.ForeignKey("demonstrations.row"), index=True)
     manifest: Mapped[PolicyManifest] = mapped_column(AsJson(PolicyManifest))
     releasable: Mapped[bool]
     learnt: Mapped[Policy] = mapped_column(Packed(Policy), deferred=True)
     covered: Mapped[Coverage] = mapped_column(Packed(Coverage), deferred=True)
-    created_at: Mapped[datetime] = mapped_column(default=now)
 
     surgeon: Mapped[Surgeon] = relationship(lazy="joined", innerjoin=True)
     demonstration: Mapped[Demonstration] = relationship(lazy="select")
     others: Mapped[list[Demonstration]] = relationship(secondary="policy_demonstrations", lazy="select", viewonly=True)
     poses: Mapped["StoredPoses | None"] = relationship(lazy="select", back_populates="policy", viewonly=True)
-    __table_args__ = (UniqueConstraint("surgeon_row", "suture", "version", name="uq_policy_versions_version"),)
+    __table_args__ = (sa.UniqueConstraint("surgeon_row", "suture", "version", name="uq_policy_versions_version"),)
 
     @property
     def demonstrations(self) -> list[Demonstration]:
@@ -389,7 +367,7 @@ class PolicyVersion(Numbered):
         return changed + [GateRefusal("marked", text) for text in sorted(marked)]
 
 
-class StoredPoses(Numbered):
+class StoredPoses(Dated):
     """The pose style of a policy version: the poses of its demonstrations' hands, and the certificate of their tube.
 
     A version whose demonstrations have no orientation has none.
@@ -398,9 +376,8 @@ class StoredPoses(Numbered):
     __tablename__ = "pose_styles"
 
     sha256: Mapped[str] = mapped_column(Sha256)
-    policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), unique=True)
+    policy_row: Mapped[int] = mapped_column(sa.ForeignKey("policy_versions.row"), unique=True)
     poses: Mapped[CertifiedPoses] = mapped_column(Packed(CertifiedPoses), deferred=True)
-    created_at: Mapped[datetime] = mapped_column(default=now)
 
     policy: Mapped[PolicyVersion] = relationship(lazy="joined", innerjoin=True, back_populates="poses")
 
@@ -410,8 +387,8 @@ class PolicyDemonstration(Base):
 
     __tablename__ = "policy_demonstrations"
 
-    policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), primary_key=True)
-    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), primary_key=True, index=True)
+    policy_row: Mapped[int] = mapped_column(sa.ForeignKey("policy_versions.row"), primary_key=True)
+    demonstration_row: Mapped[int] = mapped_column(sa.ForeignKey("demonstrations.row"), primary_key=True, index=True)
 
 
 class Release(Numbered):
@@ -419,42 +396,38 @@ class Release(Numbered):
 
     __tablename__ = "releases"
 
-    policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), index=True)
-    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
-    suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
+    policy_row: Mapped[int] = mapped_column(sa.ForeignKey("policy_versions.row"), index=True)
+    surgeon_row: Mapped[int] = mapped_column(sa.ForeignKey("surgeons.row"))
+    suture: Mapped[str] = mapped_column(sa.ForeignKey("suture_types.slug"))
     released_at: Mapped[datetime] = mapped_column(default=now)
     released_by: Mapped[str]
     withdrawn_at: Mapped[datetime | None]
 
     policy: Mapped[PolicyVersion] = relationship(lazy="select")
-    __table_args__ = (Index("ix_releases_style", "surgeon_row", "suture", "row"),)
+    __table_args__ = (sa.Index("ix_releases_style", "surgeon_row", "suture", "row"),)
 
 
-class Plan(Numbered):
+class Plan(Identified):
     """A plan: grid worlds stacked at suture points."""
 
     __tablename__ = "plans"
 
-    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
-    policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), index=True)
+    policy_row: Mapped[int] = mapped_column(sa.ForeignKey("policy_versions.row"), index=True)
     about: Mapped[PlanDescription] = mapped_column(AsJson(PlanDescription))
     plan: Mapped[SuturePlan] = mapped_column(Packed(SuturePlan), deferred=True)
-    created_at: Mapped[datetime] = mapped_column(default=now)
 
     policy: Mapped[PolicyVersion] = relationship(lazy="joined", innerjoin=True)
 
 
-class StoredPlayback(Numbered):
+class StoredPlayback(Identified):
     """The simulator's measurements of a plan, and the verdict."""
 
     __tablename__ = "playbacks"
 
-    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
-    plan_row: Mapped[int] = mapped_column(ForeignKey("plans.row"), index=True)
+    plan_row: Mapped[int] = mapped_column(sa.ForeignKey("plans.row"), index=True)
     feasible: Mapped[bool]
     report: Mapped[Verdict] = mapped_column(AsJson(Verdict))
     measured: Mapped[Playback] = mapped_column(Packed(Playback), deferred=True)
-    created_at: Mapped[datetime] = mapped_column(default=now)
 
     plan: Mapped[Plan] = relationship(lazy="joined", innerjoin=True)
 
@@ -464,12 +437,12 @@ class StoredPictures(Numbered):
 
     __tablename__ = "playback_pictures"
 
-    playback_row: Mapped[int] = mapped_column(ForeignKey("playbacks.row"), unique=True)
+    playback_row: Mapped[int] = mapped_column(sa.ForeignKey("playbacks.row"), unique=True)
     drawn: Mapped[Pictures] = mapped_column(Packed(Pictures), deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=now, index=True)
 
 
-class StoredCalibration(Numbered):
+class StoredCalibration(Dated):
     """A calibrated model of skill as plain numbers, with its data set and its accuracy; the newest one is used.
 
     It is calibrated on rated trials of a laboratory, not on the surgeons here; it contains no trial and no pseudonym.
@@ -479,4 +452,3 @@ class StoredCalibration(Numbered):
 
     sha256: Mapped[str] = mapped_column(Sha256)
     about: Mapped[Calibration] = mapped_column(AsJson(Calibration))
-    created_at: Mapped[datetime] = mapped_column(default=now)

@@ -13,30 +13,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, event, exists, or_, select
 from sqlalchemy.orm import ORMExecuteState, Session, with_loader_criteria
 
-from skills.db import Base
-from skills.db.models import (
-    Demonstration,
-    DemonstrationOutcome,
-    ErasedInterval,
-    LastUsed,
-    MeasuredShape,
-    ParsedChunk,
-    ParsedRecording,
-    Plan,
-    PolicyDemonstration,
-    PolicyVersion,
-    ProposalMark,
-    RecordingChunk,
-    RecordingSurgeon,
-    RecordingUpload,
-    Release,
-    StoredPictures,
-    StoredPlayback,
-    StoredPoses,
-    StoredRecording,
-    StoredRewardMap,
-    Surgeon,
-)
+from skills.db import Base, models
 from skills.db.service_tables import DatasetChunk, DatasetDemonstration, Job, StoredDataset, StyleToRetrain
 
 ONLY = "only"
@@ -46,10 +23,22 @@ UNRESTRICTED_TABLES = (
     *("erasures", "suture_types", "calibrations", "executors", "events", "keys", "key_surgeons", "sign_ins"),
     *("recording_uploads", "loose_chunks", "erased_surgeons", "history", "history_checkpoints", "history_tiles"),
 )
-INSIDE = (
-    *(Demonstration, PolicyVersion, Plan, StoredPlayback, RecordingUpload, StyleToRetrain),
-    *(DatasetDemonstration, StoredDataset),
-)
+# The tables whose rows are visible together with the row that one of their columns names, by this column.
+VISIBLE_WITH: dict[str, tuple[type[Base], ...]] = {
+    "surgeon_row": (
+        *(models.RecordingSurgeon, models.Demonstration, models.PolicyVersion),
+        *(models.LastUsed, models.Release),
+    ),
+    "recording_row": (models.ErasedInterval, models.ParsedRecording, models.ParsedChunk, models.ProposalMark),
+    "demonstration_row": (
+        *(models.DemonstrationOutcome, models.MeasuredShape, models.StoredRewardMap),
+        *(DatasetDemonstration, StyleToRetrain),
+    ),
+    "policy_row": (models.PolicyDemonstration, models.StoredPoses, models.Plan),
+    "plan_row": (models.StoredPlayback,),
+    "playback_row": (models.StoredPictures,),
+    "dataset_row": (DatasetChunk,),
+}
 
 
 @dataclass(frozen=True)
@@ -69,7 +58,9 @@ class Only:
         The subqueries use bare tables, to which no rule is applied again.
         """
         mine = tuple(sorted(self.surgeons))
-        demo, policy, plan, played, sent, style, exported, dataset = map(_columns, INSIDE)
+        demo, policy = _columns(models.Demonstration), _columns(models.PolicyVersion)
+        plan, played, sent = map(_columns, (models.Plan, models.StoredPlayback, models.RecordingUpload))
+        style, exported, dataset = map(_columns, (StyleToRetrain, DatasetDemonstration, StoredDataset))
         demos = select(demo.row).where(demo.surgeon_row.in_(mine))
         policies = select(policy.row).where(policy.surgeon_row.in_(mine))
         plans = select(plan.row).where(plan.policy_row.in_(policies))
@@ -82,33 +73,16 @@ class Only:
         hidden = select(exported.job_row).where(exported.demonstration_row.not_in(demos))
         exports = exists(hidden.where(exported.job_row == Job.row).correlate(Job))
         datasets = select(dataset.row).where(dataset.job_row.not_in(hidden))
-        return {
-            Surgeon: Surgeon.row.in_(mine),
-            StoredRecording: StoredRecording.row.in_(recordings),
-            RecordingSurgeon: RecordingSurgeon.surgeon_row.in_(mine),
-            ErasedInterval: ErasedInterval.recording_row.in_(recordings),
-            RecordingChunk: RecordingChunk.recording.in_(recordings),
-            ParsedRecording: ParsedRecording.recording_row.in_(recordings),
-            ParsedChunk: ParsedChunk.recording_row.in_(recordings),
-            ProposalMark: ProposalMark.recording_row.in_(recordings),
-            Demonstration: Demonstration.surgeon_row.in_(mine),
-            DemonstrationOutcome: DemonstrationOutcome.demonstration_row.in_(demos),
-            MeasuredShape: MeasuredShape.demonstration_row.in_(demos),
-            StoredRewardMap: StoredRewardMap.demonstration_row.in_(demos),
-            PolicyVersion: PolicyVersion.surgeon_row.in_(mine),
-            PolicyDemonstration: PolicyDemonstration.policy_row.in_(policies),
-            StoredPoses: StoredPoses.policy_row.in_(policies),
-            LastUsed: LastUsed.surgeon_row.in_(mine),
-            Release: Release.surgeon_row.in_(mine),
-            Plan: Plan.policy_row.in_(policies),
-            StoredPlayback: StoredPlayback.plan_row.in_(plans),
-            StoredPictures: StoredPictures.playback_row.in_(playbacks),
+        visible: dict[str, object] = {"surgeon_row": mine, "recording_row": recordings, "demonstration_row": demos}
+        visible |= {"policy_row": policies, "plan_row": plans, "playback_row": playbacks, "dataset_row": datasets}
+        rules = {of: getattr(of, name).in_(visible[name]) for name, tables in VISIBLE_WITH.items() for of in tables}
+        return rules | {
+            models.Surgeon: models.Surgeon.row.in_(mine),
+            models.StoredRecording: models.StoredRecording.row.in_(recordings),
+            models.RecordingChunk: models.RecordingChunk.recording.in_(recordings),
+            StoredDataset: StoredDataset.row.in_(datasets),
             # Batches, their parts and exports belong to no single surgeon; one with data of a hidden surgeon is hidden.
             Job: or_(Job.surgeon_row.in_(mine), and_(Job.surgeon_row.is_(None), ~others, ~exports)),
-            DatasetDemonstration: DatasetDemonstration.demonstration_row.in_(demos),
-            StoredDataset: StoredDataset.row.in_(datasets),
-            DatasetChunk: DatasetChunk.dataset_row.in_(datasets),
-            StyleToRetrain: StyleToRetrain.demonstration_row.in_(demos),
         }
 
     @cached_property

@@ -9,20 +9,10 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, cast
 
-from sqlalchemy import (
-    BigInteger,
-    CheckConstraint,
-    ForeignKey,
-    Index,
-    LargeBinary,
-    String,
-    Table,
-    UniqueConstraint,
-    insert,
-)
+import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
-from skills.db import AsJson, Base, Number, Numbered, Sha256, now, partial_index
+from skills.db import AsJson, Base, Dated, Identified, Number, Numbered, Sha256, now, partial_index
 from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
 from skills.schemas.operation import JobState
@@ -32,7 +22,7 @@ from skills.settings import Role
 LONGEST_REASON = 2000  # characters
 
 
-class Job(Numbered):
+class Job(Dated):
     """A request for work.
 
     `identity` is the digest of its resolved inputs: there is at most one active or succeeded job of an identity.
@@ -44,31 +34,30 @@ class Job(Numbered):
 
     __tablename__ = "jobs"
 
-    id: Mapped[str] = mapped_column(String(32), unique=True)
-    kind: Mapped[str] = mapped_column(String(20))
+    id: Mapped[str] = mapped_column(sa.String(32), unique=True)
+    kind: Mapped[str] = mapped_column(sa.String(20))
     identity: Mapped[str] = mapped_column(Sha256)
-    state: Mapped[JobState] = mapped_column(String(10), default="queued")
+    state: Mapped[JobState] = mapped_column(sa.String(10), default="queued")
     progress: Mapped[float] = mapped_column(default=0.0)
     request: Mapped[dict[str, Any]]
     result: Mapped[dict[str, Any] | None]
-    error: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
+    error: Mapped[str | None] = mapped_column(sa.String(LONGEST_REASON))
     attempt: Mapped[int] = mapped_column(default=1)
     surgeon_row: Mapped[Number | None] = mapped_column(index=True)
     plan: Mapped[str | None] = mapped_column(Sha256)
     requested_by: Mapped[str] = mapped_column(default="local")
     submitted_at: Mapped[datetime | None]
-    created_at: Mapped[datetime] = mapped_column(default=now)
     started_at: Mapped[datetime | None]
     ended_at: Mapped[datetime | None]
 
     __table_args__ = (
-        CheckConstraint("state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled')", name="state"),
-        CheckConstraint("progress >= 0 AND progress <= 1", name="progress"),
-        Index("ix_jobs_identity", "identity", "row"),
-        Index("ix_jobs_state", "state", "row"),
-        Index("ix_jobs_kind_row", "kind", "row"),
-        Index("ix_jobs_kind_state", "kind", "state", "row"),  # also for the counts at every metrics scrape
-        Index("ix_jobs_plan", "plan", "kind", "row"),
+        sa.CheckConstraint("state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled')", name="state"),
+        sa.CheckConstraint("progress >= 0 AND progress <= 1", name="progress"),
+        sa.Index("ix_jobs_identity", "identity", "row"),
+        sa.Index("ix_jobs_state", "state", "row"),
+        sa.Index("ix_jobs_kind_row", "kind", "row"),
+        sa.Index("ix_jobs_kind_state", "kind", "state", "row"),  # also for the counts at every metrics scrape
+        sa.Index("ix_jobs_plan", "plan", "kind", "row"),
         # for the retention: the others have not ended
         partial_index("ix_jobs_ended", "ended_at", where="ended_at IS NOT NULL"),
         # so that failed and cancelled jobs can be requested again
@@ -95,25 +84,25 @@ class StyleToRetrain(Numbered):
 
     __tablename__ = "retraining_styles"
 
-    job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
-    part_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
-    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), index=True)
+    job_row: Mapped[int] = mapped_column(sa.ForeignKey("jobs.row"))
+    part_row: Mapped[int] = mapped_column(sa.ForeignKey("jobs.row"))
+    demonstration_row: Mapped[int] = mapped_column(sa.ForeignKey("demonstrations.row"), index=True)
     stale: Mapped[list[Any]]
-    state: Mapped[str] = mapped_column(String(10), default="queued")
+    state: Mapped[str] = mapped_column(sa.String(10), default="queued")
     tries: Mapped[int] = mapped_column(default=0)
-    policy_row: Mapped[int | None] = mapped_column(ForeignKey("policy_versions.row"), index=True)
-    reason: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
+    policy_row: Mapped[int | None] = mapped_column(sa.ForeignKey("policy_versions.row"), index=True)
+    reason: Mapped[str | None] = mapped_column(sa.String(LONGEST_REASON))
     comparison: Mapped[StoredComparison | None] = mapped_column(AsJson(StoredComparison))
     ended_at: Mapped[datetime | None]
 
     demonstration: Mapped[Demonstration] = relationship(lazy="joined", innerjoin=True)
     policy: Mapped[PolicyVersion | None] = relationship(lazy="selectin")  # with a join SQLite would read all rows
     __table_args__ = (
-        CheckConstraint("state IN ('queued', 'done', 'failed', 'cancelled')", name="state"),
-        UniqueConstraint("job_row", "demonstration_row", name="uq_retraining_styles_demonstration"),
-        Index("ix_retraining_styles_job", "job_row", "row"),
-        Index("ix_retraining_styles_state", "job_row", "state", "row"),
-        Index("ix_retraining_styles_part", "part_row", "state"),
+        sa.CheckConstraint("state IN ('queued', 'done', 'failed', 'cancelled')", name="state"),
+        sa.UniqueConstraint("job_row", "demonstration_row", name="uq_retraining_styles_demonstration"),
+        sa.Index("ix_retraining_styles_job", "job_row", "row"),
+        sa.Index("ix_retraining_styles_state", "job_row", "state", "row"),
+        sa.Index("ix_retraining_styles_part", "part_row", "state"),
     )
 
 
@@ -125,24 +114,22 @@ class DatasetDemonstration(Base):
 
     __tablename__ = "dataset_demonstrations"
 
-    job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"), primary_key=True)
-    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), primary_key=True, index=True)
-    split: Mapped[str] = mapped_column(String(10))
+    job_row: Mapped[int] = mapped_column(sa.ForeignKey("jobs.row"), primary_key=True)
+    demonstration_row: Mapped[int] = mapped_column(sa.ForeignKey("demonstrations.row"), primary_key=True, index=True)
+    split: Mapped[str] = mapped_column(sa.String(10))
     whole: Mapped[bool]
 
-    __table_args__ = (CheckConstraint("split IN ('train', 'val', 'test', 'recovery', 'failure')", name="split"),)
+    __table_args__ = (sa.CheckConstraint("split IN ('train', 'val', 'test', 'recovery', 'failure')", name="split"),)
 
 
-class StoredDataset(Numbered):
+class StoredDataset(Identified):
     """An exported dataset, identified by the SHA-256 of its zip file."""
 
     __tablename__ = "datasets"
     media_type = "application/zip"
 
-    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
-    job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"), unique=True)
-    size_bytes: Mapped[int] = mapped_column(BigInteger)
-    created_at: Mapped[datetime] = mapped_column(default=now)
+    job_row: Mapped[int] = mapped_column(sa.ForeignKey("jobs.row"), unique=True)
+    size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
 
 
 class DatasetChunk(Base):
@@ -150,9 +137,9 @@ class DatasetChunk(Base):
 
     __tablename__ = "dataset_chunks"
 
-    dataset_row: Mapped[int] = mapped_column(ForeignKey("datasets.row"), primary_key=True)
+    dataset_row: Mapped[int] = mapped_column(sa.ForeignKey("datasets.row"), primary_key=True)
     number: Mapped[int] = mapped_column(primary_key=True)
-    data: Mapped[bytes] = mapped_column(LargeBinary)
+    data: Mapped[bytes] = mapped_column(sa.LargeBinary)
 
 
 class Executor(Base):
@@ -163,13 +150,13 @@ class Executor(Base):
 
     __tablename__ = "executors"
 
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    id: Mapped[str] = mapped_column(sa.String(64), primary_key=True)
     beat_at: Mapped[datetime] = mapped_column(default=now)
     verified_at: Mapped[datetime | None]
     faults_found: Mapped[int | None]
 
 
-class Key(Numbered):
+class Key(Dated):
     """An API key of a person or a program: the digest of its secret, which is not stored itself, and its permissions.
 
     `id` is the public part of the key. `restricted` limits a key to its surgeons even when all of them are erased.
@@ -177,18 +164,19 @@ class Key(Numbered):
 
     __tablename__ = "keys"
 
-    id: Mapped[str] = mapped_column(String(16), unique=True)
+    id: Mapped[str] = mapped_column(sa.String(16), unique=True)
     digest: Mapped[str] = mapped_column(Sha256)
-    owner: Mapped[str] = mapped_column(String(64))
-    role: Mapped[Role] = mapped_column(String(10))
+    owner: Mapped[str] = mapped_column(sa.String(64))
+    role: Mapped[Role] = mapped_column(sa.String(10))
     restricted: Mapped[bool]
-    created_at: Mapped[datetime] = mapped_column(default=now)
     created_by: Mapped[str]
     expires_at: Mapped[datetime | None]
     revoked_at: Mapped[datetime | None]
 
     surgeons: Mapped[list[Surgeon]] = relationship(secondary="key_surgeons", lazy="selectin", order_by=Surgeon.slug)
-    __table_args__ = (CheckConstraint("role IN ('reader', 'uploader', 'trainer', 'releaser', 'admin')", name="role"),)
+    __table_args__ = (
+        sa.CheckConstraint("role IN ('reader', 'uploader', 'trainer', 'releaser', 'admin')", name="role"),
+    )
 
 
 class KeySurgeon(Base):
@@ -196,8 +184,8 @@ class KeySurgeon(Base):
 
     __tablename__ = "key_surgeons"
 
-    key_row: Mapped[int] = mapped_column(ForeignKey("keys.row"), primary_key=True)
-    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row", ondelete="CASCADE"), primary_key=True)
+    key_row: Mapped[int] = mapped_column(sa.ForeignKey("keys.row"), primary_key=True)
+    surgeon_row: Mapped[int] = mapped_column(sa.ForeignKey("surgeons.row", ondelete="CASCADE"), primary_key=True)
 
 
 class SignIn(Base):
@@ -206,7 +194,7 @@ class SignIn(Base):
     __tablename__ = "sign_ins"
 
     digest: Mapped[str] = mapped_column(Sha256, primary_key=True)
-    key_row: Mapped[int] = mapped_column(ForeignKey("keys.row"))
+    key_row: Mapped[int] = mapped_column(sa.ForeignKey("keys.row"))
     created_at: Mapped[datetime] = mapped_column(default=now)
     used_at: Mapped[datetime] = mapped_column(default=now)
 
@@ -224,12 +212,12 @@ class Event(Numbered):
     action: Mapped[str]
     object_kind: Mapped[str]
     object_id: Mapped[str]
-    subject: Mapped[str | None] = mapped_column(String(32), index=True)
+    subject: Mapped[str | None] = mapped_column(sa.String(32), index=True)
 
 
 # Without a foreign key, but in the order in which they are backed up and restored: older schemas have the keys.
 for _late, _first in ((Job, Surgeon), (RecordingChunk, StoredRecording)):
-    cast(Table, _late.__table__).add_is_dependent_on(cast(Table, _first.__table__))
+    cast(sa.Table, _late.__table__).add_is_dependent_on(cast(sa.Table, _first.__table__))
 
 
 # ---- the audit log -------------------------------------------------------------------------------------------------
@@ -246,25 +234,13 @@ def record_events(
     session: Session, actor: str, action: str, object_kind: str, objects: Sequence[tuple[str, Surgeon | None]]
 ) -> None:
     """Add one event for each of several objects of one kind, each with its surgeon, to the caller's transaction."""
-    if objects:
-        at = now()
-        add = insert(cast(Table, Event.__table__))
-        # One statement on the bare table for all of them: a batch adds many events at once.
-        session.execute(add, [_event(at, actor, action, object_kind, *one) for one in objects])
-
-
-def _event(
-    at: datetime, actor: str, action: str, object_kind: str, object_id: str, surgeon: Surgeon | None
-) -> dict[str, Any]:
-    subject = surgeon.subject if surgeon else None
-    # The random part makes the digests of two equal events at one moment different.
-    identity = [at.isoformat(), actor, action, object_kind, object_id, subject, secrets.token_hex(8)]
-    return {
-        "sha256": sha256(canonical(identity)),
-        "at": at,
-        "actor": actor,
-        "action": action,
-        "object_kind": object_kind,
-        "object_id": object_id,
-        "subject": subject,
-    }
+    at = now()
+    events = []
+    for object_id, surgeon in objects:
+        subject = surgeon.subject if surgeon else None
+        # The random part makes the digests of two equal events at one moment different.
+        identity = [at.isoformat(), actor, action, object_kind, object_id, subject, secrets.token_hex(8)]
+        event = {"at": at, "actor": actor, "action": action, "object_kind": object_kind}
+        events.append(event | {"sha256": sha256(canonical(identity)), "object_id": object_id, "subject": subject})
+    if events:  # one statement on the bare table for all of them: a batch adds many events at once
+        session.execute(sa.insert(cast(sa.Table, Event.__table__)), events)

@@ -20,7 +20,7 @@ and releases are identified by their content, so a repeated one is found or stor
 import logging
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from copy import copy
 from pathlib import Path
 from typing import Self
@@ -93,7 +93,7 @@ class Database:
     @contextmanager
     def reading(self) -> Iterator[Session]:
         """Open a session that reads one consistent state."""
-        with self._errors(), self._sessions() as session:
+        with translating_errors(self.engine.url), self._sessions() as session:
             yield session
 
     @contextmanager
@@ -109,7 +109,7 @@ class Database:
         check, further = self._condition
         locks = True if names is None else tuple(sorted({lock_number(name) for name in (*names, *further)}))
         bind = self.engine.execution_options(writes=locks)
-        with self._errors(), self._sessions(bind=bind) as session, session.begin():
+        with translating_errors(self.engine.url), self._sessions(bind=bind) as session, session.begin():
             check(session)
             yield session
             if session.in_transaction():  # otherwise the block has undone its changes
@@ -154,7 +154,7 @@ class Database:
             Busy: It cannot be reached or written.
             BadSettings: The signing key of its history is missing, or cannot be made.
         """
-        with self._errors(), self.engine.execution_options(writes=True).connect() as connection:
+        with translating_errors(self.engine.url), self.engine.execution_options(writes=True).connect() as connection:
             before = revision_of(connection)
             refuse_unknown(before)
             if before != revisions()[0] and inspect(connection).has_table(CHECKPOINTS.name):
@@ -177,16 +177,14 @@ class Database:
         """
         if self.engine.dialect.name != "sqlite":
             return  # PostgreSQL's vacuum does it
-        with self._errors(), self.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        engine = self.engine.execution_options(isolation_level="AUTOCOMMIT")
+        with translating_errors(self.engine.url), engine.connect() as connection:
             connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def close(self) -> None:
         """Close all connections; one that a thread still uses is closed when the thread returns it."""
         event.listen(self.engine.pool, "checkin", _close_returned)  # to a pool that nobody disposes of any more
         self.engine.dispose()
-
-    def _errors(self) -> AbstractContextManager[None]:
-        return translating_errors(self.engine.url)
 
 
 def _close_returned(_connection: DBAPIConnection | None, entry: ConnectionPoolEntry) -> None:

@@ -3,12 +3,9 @@
 from collections.abc import Callable, Iterable
 from copy import copy
 from threading import Lock
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from cachetools import LRUCache
-
-if TYPE_CHECKING:
-    pass
 
 K = TypeVar("K")
 V = TypeVar("V")

@@ -40,12 +40,9 @@ Plan = list[str]
 
 @pytest.fixture(scope="module", params=backends.BACKENDS)
 def filled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
-    url = backends.fresh(request.param, tmp_path_factory.mktemp("hospital"))
-    database = Database(url)
-    hospital.fill(database, 5)
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.fresh(request.param, tmp_path_factory.mktemp("hospital"))) as database:
+        hospital.fill(database, 5)
+        yield database
 
 
 def newest(session: Session) -> Any:

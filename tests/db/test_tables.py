@@ -8,19 +8,7 @@ from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError, IntegrityError
 
 from skills.comparison.distances import STATES, Measured
-from skills.db import Base, now, service_tables
-from skills.db.models import (
-    DemonstrationOutcome,
-    ErasedInterval,
-    Erasure,
-    LastUsed,
-    MeasuredShape,
-    ProposalMark,
-    RecordingSurgeon,
-    StoredCalibration,
-    StoredPictures,
-    StoredPlayback,
-)
+from skills.db import Base, models, now, service_tables
 from skills.db.session import Database
 from skills.library.people.keys import create_key
 from skills.library.people.sign_ins import SignInLifetime, sign_in
@@ -67,12 +55,9 @@ THE_HISTORY = {"history", "history_checkpoints", "history_tiles"}  # see `test_h
 @pytest.fixture(scope="module", params=backends.BACKENDS)
 def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
     """Yield a database with at least one row in every append-only table."""
-    url = backends.fresh(request.param, tmp_path_factory.mktemp("full"))
-    database = Database(url)
-    fill(database)
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.fresh(request.param, tmp_path_factory.mktemp("full"))) as database:
+        fill(database)
+        yield database
 
 
 def fill(database: Database) -> None:
@@ -88,13 +73,17 @@ def fill(database: Database) -> None:
     with database.writing() as session:
         motion = small_trajectory(1)
         verdict = verdict_on(plan.sha256, motion, ideal_playback(motion))
-        played = StoredPlayback(sha256="0" * 64, plan_row=plan.row, feasible=True, report=verdict, measured=PLAYBACK)
+        played = models.StoredPlayback(
+            sha256="0" * 64, plan_row=plan.row, feasible=True, report=verdict, measured=PLAYBACK
+        )
         session.add(played)
         session.flush()
-        session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
-        session.add(StoredCalibration(sha256="0" * 64, about=calibration("Suturing")))
-        session.add(DemonstrationOutcome(demonstration_row=demo.row, outcome="failure", reason="fell", actor="ada"))
-        session.add(ProposalMark(recording_row=demo.recording_row, number=1, state="rejected", actor="ada"))
+        session.add(models.StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
+        session.add(models.StoredCalibration(sha256="0" * 64, about=calibration("Suturing")))
+        session.add(
+            models.DemonstrationOutcome(demonstration_row=demo.row, outcome="failure", reason="fell", actor="ada")
+        )
+        session.add(models.ProposalMark(recording_row=demo.recording_row, number=1, state="rejected", actor="ada"))
         job = service_tables.Job(id="0" * 16, kind="dataset", identity="0" * 64, request={})
         session.add(job)
         session.flush()
@@ -104,12 +93,12 @@ def fill(database: Database) -> None:
         session.add(dataset)
         session.flush()
         session.add(service_tables.DatasetChunk(dataset_row=dataset.row, number=0, data=b"0"))
-        session.add(Erasure(salt="0" * 64, digest="0" * 64))
-        session.add(ErasedInterval(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
-        session.add(LastUsed(surgeon_row=demo.surgeon_row, suture=cases.SUTURE, last=7))
-        session.add(RecordingSurgeon(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
+        session.add(models.Erasure(salt="0" * 64, digest="0" * 64))
+        session.add(models.ErasedInterval(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
+        session.add(models.LastUsed(surgeon_row=demo.surgeon_row, suture=cases.SUTURE, last=7))
+        session.add(models.RecordingSurgeon(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
         shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]), np.ones(3))
-        session.add(MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))
+        session.add(models.MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))
         key, _ = create_key(session, "ada", "reader", "test", surgeons=["kestrel"])
         sign_in(session, key.id, SignInLifetime(60.0, 600.0))
 

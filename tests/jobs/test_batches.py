@@ -33,11 +33,8 @@ STOPPED_S = 2.0  # the other workers' transactions end within that time, or the 
 
 @pytest.fixture
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
-    url = backends.fresh(request.param, tmp_path)
-    database = Database(url)
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.fresh(request.param, tmp_path)) as database:
+        yield database
 
 
 @contextmanager

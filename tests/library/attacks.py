@@ -103,7 +103,7 @@ def random_edit(connection: Connection, rng: random.Random) -> tuple[str, str]:
 
 
 def _some_edit(connection: Connection, rng: random.Random) -> tuple[str, str]:
-    filled = {name: [row for page in about.pages(connection) for row in page] for name, about in logged().items()}
+    filled = {name: connection.execute(about.in_order).all() for name, about in logged().items()}
     table = rng.choice([name for name, rows in filled.items() if rows])
     about, row = logged()[table], rng.choice(filled[table])
     key = about.key_of(row)

@@ -78,6 +78,18 @@ def upload(data: bytes, media_type: str = "text/csv", **how: Any) -> Upload:
     return Upload(io.BytesIO(data), sha256(data), len(data), media_type, **how)
 
 
+def commit(database: Database, function: Callable[..., T], *given: Any, **how: Any) -> T:
+    """Call a function of the library in a writing transaction, and return its result."""
+    with database.writing() as session:
+        return function(session, *given, **how)
+
+
+def fetch(database: Database, function: Callable[..., T], *given: Any, **how: Any) -> T:
+    """Call a function of the library in a reading transaction, and return its result."""
+    with database.reading() as session:
+        return function(session, *given, **how)
+
+
 def add_surgeon(database: Database, slug: str = "kestrel", **about: Any) -> None:
     with database.writing() as session:
         seed_suture_types(session)
@@ -134,6 +146,12 @@ def work(database: Database, job: Job) -> Job:
         return session.get_one(Job, job.row)
 
 
+def wrong(database: Database, *left_out: str, **how: Any) -> list[tuple[str, str]]:
+    """Inspect everything that is stored, as `skills verify` does, and return the faults, except those of some parts."""
+    parts = {id(part): part for part in list(inspect_installation(database, **how))}.values()
+    return [one for part in parts for one in part.wrong if part.what not in left_out]
+
+
 @contextmanager
 def working(settings: Settings) -> Iterator[None]:
     """Carry out all jobs in a thread, in the place of `skills.serving.working`: no process to start for each command.
@@ -180,9 +198,3 @@ def add_plan(database: Database, surgeon: str = "kestrel", **asked: Any) -> Plan
         PlanIn(surgeon=surgeon, suture=SUTURE, suture_points=[{"position_mm": (5.0, 55.0, -125.0)}], **asked),
         "test",
     )[0]
-
-
-def wrong(database: Database, *left_out: str) -> list[tuple[str, str]]:
-    """Inspect everything that is stored, as `skills verify` does, and return the faults, except those of some parts."""
-    parts = {part.what: part for part in inspect_installation(database)}
-    return [one for part in parts.values() for one in part.wrong if part.what not in left_out]

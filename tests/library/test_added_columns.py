@@ -83,10 +83,8 @@ def widen(patch: pytest.MonkeyPatch, folder: Path) -> None:
 @pytest.fixture(params=backends.BACKENDS)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
     """Yield a signed database of this version with rows in every logged table."""
-    url = backends.copy_of("filled", _fill, request.param, tmp_path)
-    with closing(Database(url)) as database:
+    with backends.opened(backends.copy_of("filled", _fill, request.param, tmp_path)) as database:
         yield database
-    backends.drop(url)
 
 
 def _fill(url: str) -> None:
@@ -98,7 +96,7 @@ def _fill(url: str) -> None:
 
 def first_key(database: Database, about: Logged) -> str:
     with database.reading() as session:
-        return about.key_of(next(about.pages(session.connection()))[0])
+        return about.key_of(session.execute(about.in_order).first())
 
 
 def test_columns_added_to_every_logged_table_keep_every_history(

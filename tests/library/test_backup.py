@@ -1,7 +1,7 @@
 """Backups: during writes, between the back ends, damaged, of other versions; and erasures persist."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,13 @@ import pytest
 from sqlalchemy import select, text
 
 from skills.db import Base, dump
+from skills.db.logged_rows import KINDS
 from skills.db.models import Demonstration, Erasure, Surgeon
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt, Erased
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.erasure_list import Erasures, erasures_of, keep_erasures, read_erasures
-from skills.library.operation.inspection import inspect_installation
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.versions import served_release
@@ -26,23 +26,7 @@ from tests import backends
 from tests.api.service import Service
 from tests.jobs.house import House
 from tests.library import cases
-
-OTHER = {"sqlite": "postgresql", "postgresql": "sqlite"}
-
-
-@pytest.fixture
-def empty(tmp_path: Path) -> Iterator[Callable[[str], Database]]:
-    """Yield a function that creates databases without tables."""
-    made: list[Database] = []
-
-    def make(backend: str) -> Database:
-        made.append(Database(backends.blank(backend, tmp_path)))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
-        backends.drop(one.url)
+from tests.library.cases import commit, wrong
 
 
 def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
@@ -57,10 +41,6 @@ def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
     for table in ("history", "history_checkpoints"):  # goes on with a restore; `wrong` verifies it
         del found[table]
     return found
-
-
-def wrong(database: Database) -> list[tuple[str, str]]:
-    return [one for checked in inspect_installation(database) for one in checked.wrong]
 
 
 def etags(database: Database) -> dict[str, str]:
@@ -106,7 +86,7 @@ def test_a_backup_under_writes_is_one_state_and_restores_on_both_databases(
     assert errors == []
     for number, (before, manifest) in enumerate(taken):
         kind = database.engine.dialect.name
-        for backend in (OTHER[kind],) if number == 1 else (kind,):
+        for backend in (backends.OTHER[kind],) if number == 1 else (kind,):
             restored = empty(backend)
             restore(restored, tmp_path / f"{number}.zip")
             found = rows(restored)
@@ -117,7 +97,7 @@ def test_a_backup_under_writes_is_one_state_and_restores_on_both_databases(
             assert wrong(restored) == []
     same = rows(database)
     back_up(database, tmp_path / "last.zip")
-    last = empty(OTHER[database.engine.dialect.name])
+    last = empty(backends.OTHER[database.engine.dialect.name])
     restore(last, tmp_path / "last.zip")
     assert rows(last) == same
     assert etags(last) == etags(database) != {}
@@ -154,7 +134,7 @@ def test_jobs_that_had_not_ended_are_told_again_and_done(
         session.execute(text("UPDATE jobs SET submitted_at = created_at"))
         session.execute(text("UPDATE jobs SET state = 'running' WHERE row = :row"), {"row": begun.row})
     back_up(database, tmp_path / "b.zip")
-    restored = empty(OTHER[database.engine.dialect.name])
+    restored = empty(backends.OTHER[database.engine.dialect.name])
     restore(restored, tmp_path / "b.zip")
     for job in (waiting, begun):
         with restored.reading() as session:
@@ -254,16 +234,14 @@ def test_a_demo_erased_and_added_again_before_the_backup_is_not_erased(
     database: Database, empty: Callable[[str], Database], tmp_path: Path
 ):
     demo = cases.add_demo(database).sha256
-    with database.writing() as session:
-        erase_demo(session, demo, "test")
+    commit(database, erase_demo, demo, "test")
     assert cases.add_demo(database).sha256 == demo
     back_up(database, tmp_path / "b.zip")
     keep_erasures(database, tmp_path / "list.json")
     listed = read_erasures(str(tmp_path / "list.json"))
-    restored = empty(OTHER[database.engine.dialect.name])
+    restored = empty(backends.OTHER[database.engine.dialect.name])
     assert restore(restored, tmp_path / "b.zip", listed).demos_erased == 0
-    with database.writing() as session:
-        erase_demo(session, demo, "test")
+    commit(database, erase_demo, demo, "test")
     keep_erasures(database, tmp_path / "list.json")
     again = empty("sqlite")
     assert restore(again, tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json"))).demos_erased == 1
@@ -274,8 +252,7 @@ def test_a_list_of_erasures_never_shrinks_and_is_refused_if_altered(database: Da
     at = datetime(2026, 1, 1, tzinfo=UTC)
     earlier = Erasures({"11" * 32: ("00", at)}, {"demonstrations": {"ab" * 32: at}})
     assert keep_erasures(database, kept).surgeons == {}
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    commit(database, erase_surgeon, "kestrel", "test")
     now_listed = keep_erasures(database, kept)
     other = Database(backends.fresh("sqlite", tmp_path))
     assert keep_erasures(other, kept) == now_listed == read_erasures(str(kept))
@@ -300,4 +277,4 @@ def test_a_copied_list_may_be_given_to_an_installation_that_knows_it(database: D
 
 def test_every_column_of_every_table_is_known_to_the_backup():
     assert {t.name for t in dump.tables()} | dump.LEFT_OUT == set(Base.metadata.tables)
-    assert all(dump.kind_of(column) in dump.KINDS for table in dump.tables() for column in table.columns)
+    assert all(dump.kind_of(column) in KINDS for table in dump.tables() for column in table.columns)

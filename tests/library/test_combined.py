@@ -234,13 +234,9 @@ def test_a_combined_policy_is_restored_with_its_demos_on_another_back_end(databa
     demos = add_three(database)
     train(database, demos, release=True)
     back_up(database, tmp_path / "all.zip")
-    other = Database(backends.blank("postgresql" if database.engine.dialect.name == "sqlite" else "sqlite", tmp_path))
-    try:
+    with backends.opened(backends.blank(backends.OTHER[database.engine.dialect.name], tmp_path)) as other:
         restore(other, tmp_path / "all.zip")
         assert (counted(other, PolicyDemonstration), served(other), wrong(other)) == (2, [1], [])
         with other.writing() as session:
             withdraw_demo(session, demos[0].sha256, "test")
         assert served(other) == []
-    finally:
-        other.close()
-        backends.drop(other.url)

@@ -9,6 +9,7 @@ from skills.errors import BadPlan, NotFound
 from skills.library.plans.plans import find_plan, trajectory_of
 from skills.library.plans.replay_comparison import compare_with_plan
 from tests.library import cases
+from tests.library.cases import fetch
 
 
 def stored(database: Database, bag: bytes, surgeon: str) -> Demonstration:
@@ -32,8 +33,7 @@ def recorded(database: Database, plan: Plan, *, off_mm: tuple[float, float, floa
 
 def test_a_replay_that_was_off_by_a_millimetre_is_said_to_be(database: Database, plan: Plan):
     demo = recorded(database, plan, off_mm=(0.0, 0.0, 1.0))
-    with database.reading() as session:
-        found = compare_with_plan(session, plan.sha256, demo.sha256)
+    found = fetch(database, compare_with_plan, plan.sha256, demo.sha256)
     assert found.start_mm == pytest.approx(1.0, abs=1e-9)
     assert found.end_mm == pytest.approx(1.0, abs=0.1)  # mm; the last sample was not recorded
     assert 0.4 <= found.mean_mm <= 1.0  # the offset is along z, where the alignment can shift the paths
@@ -43,8 +43,7 @@ def test_a_replay_that_was_off_by_a_millimetre_is_said_to_be(database: Database,
 
 def test_a_replay_that_went_as_planned_is_nowhere_off(database: Database, plan: Plan):
     demo = recorded(database, plan, off_mm=(0.0, 0.0, 0.0))
-    with database.reading() as session:
-        found = compare_with_plan(session, plan.sha256, demo.sha256)
+    found = fetch(database, compare_with_plan, plan.sha256, demo.sha256)
     assert found.mean_mm < 0.1
     assert np.max(found.rmse_mm) < 0.2
     assert found.max_mm < 0.5

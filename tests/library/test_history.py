@@ -43,6 +43,7 @@ from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed, check_inclusion
 from tests.library import cases
 from tests.library.attacks import cover_up, found, random_edit, sign_again, tampering
+from tests.library.cases import commit, fetch
 
 SURGEONS = logged()["surgeons"].raw
 
@@ -50,14 +51,11 @@ SURGEONS = logged()["surgeons"].raw
 @pytest.fixture(scope="module", params=backends.BACKENDS)
 def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
     """Yield a signed database with rows in every logged table; its tests undo their changes."""
-    url = backends.fresh(request.param, tmp_path_factory.mktemp("full"))
-    database = Database(url)
-    sign_history(database)
-    fill(database)
-    sign_history(database)
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.fresh(request.param, tmp_path_factory.mktemp("full"))) as database:
+        sign_history(database)
+        fill(database)
+        sign_history(database)
+        yield database
 
 
 def wrong_in(database: Database) -> list[tuple[str, str]]:
@@ -337,7 +335,7 @@ def test_digests_that_are_not_the_logged_ones_are_no_ground_to_sign(full: Databa
 def test_digests_changed_for_a_while_get_into_no_later_leaf(full: Database):
     for table, by_somebody, by_service in CHANGED:
         with full.engine.execution_options(writes=True).connect() as connection:
-            key = logged()[table].key_of(next(logged()[table].pages(connection))[0])
+            key = logged()[table].key_of(connection.execute(logged()[table].in_order).first())
             kept = latest_leaves(connection, table, [key])[key]
             connection.exec_driver_sql(f"UPDATE {table} SET {by_somebody}")
             take_notes(connection)
@@ -425,8 +423,7 @@ def test_a_row_that_was_erased_and_is_put_back_with_its_old_leaf_is_found(databa
     with database.reading() as session:
         row = session.execute(select(SURGEONS).where(SURGEONS.c.row == 2)).one()._mapping
         old = session.execute(leaf).one()._mapping
-    with database.writing() as session:
-        erase_surgeon(session, "heron", "test")
+    commit(database, erase_surgeon, "heron", "test")
     sign_history(database)
     with tampering(database) as connection:
         connection.execute(SURGEONS.insert(), [dict(row)])
@@ -465,8 +462,7 @@ def test_a_cache_may_be_emptied_by_hand_and_is_logged_again(database: Database):
         with database.reading() as session:
             leaves = session.scalars(select(LEAVES.c.row).where(LEAVES.c.table_name == "parsed_recordings")).all()
         assert len(leaves) == turn + 2
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    commit(database, erase_surgeon, "kestrel", "test")
     assert wrong_in(database) == []
 
 
@@ -485,8 +481,7 @@ def test_uploads_erasures_and_retentions_in_steps_keep_the_history_whole(
     cases.add_demo(database, cases.hand_off((1.0, 0.0, 0.0)), "heron")
     cases.train(database, "heron")
     assert wrong_in(database) == []
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    commit(database, erase_surgeon, "kestrel", "test")
     assert wrong_in(database) == []  # what is left to the sweep is logged still
     sweep.sweep_erased(database)
     assert wrong_in(database) == []
@@ -541,8 +536,7 @@ def test_proofs_are_checked_offline_and_stay_valid_after_an_erasure(database: Da
         node = node_from(stored_tiles(connection))
         proofs = {number: inclusion_proof(len(leaves), number, node) for number, _ in leaves}
         verifier = database.history.key.verifier(note.partition("\n")[0])
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    commit(database, erase_surgeon, "kestrel", "test")
     sign_history(database)
     with database.reading() as session:
         after = dict(session.execute(select(LEAVES.c.number, LEAVES.c.entry)).all())
@@ -598,8 +592,7 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
     cases.train(database, release=True)
     sign_history(database)
     asked = ("kestrel", cases.SUTURE, now())
-    with database.reading() as session:
-        given = served_at(session, database.history, *asked)
+    given = fetch(database, served_at, database.history, *asked)
     for proof in given.proofs:
         check_disclosed(proof.model_dump(), given.checkpoint.note, given.checkpoint.verifier)
     for edit in (

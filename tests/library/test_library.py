@@ -38,6 +38,7 @@ from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
+from tests.library.cases import commit
 
 AT_ONCE = 8
 SHAKE = np.random.default_rng(5).normal(0, 0.4, (150, 3)).clip(-1, 1)  # mm, less than a quarter of a cell
@@ -60,8 +61,7 @@ def counts(database: Database) -> dict[str, int]:
 
 
 def test_the_catalogue_is_seeded_once(database: Database):
-    with database.writing() as session:
-        assert seed_suture_types(session) == 0
+    assert commit(database, seed_suture_types) == 0
     assert counts(database)["suture_types"] == 11
 
 
@@ -137,8 +137,7 @@ def test_a_hysteresis_that_cannot_be_meant_leaves_no_row(database: Database):
 
 def test_the_same_surgeon_eight_times_at_once_is_one_surgeon(database: Database):
     def put(_: int) -> None:
-        with database.writing() as session:
-            put_surgeon(session, "heron", SurgeonIn(), "test")
+        commit(database, put_surgeon, "heron", SurgeonIn(), "test")
 
     at_once(put)
     assert counts(database)["surgeons"] == 2
@@ -185,8 +184,7 @@ def test_a_job_cancelled_while_it_learns_leaves_no_policy(database: Database, mo
     job = cases.ask_training(database, release=True)
 
     def cancel() -> None:
-        with database.writing() as session:
-            jobs.cancel(session, job.id, "test")
+        commit(database, jobs.cancel, job.id, "test")
 
     interrupted(monkeypatch, cancel)
     assert cases.work(database, job).state == "cancelled"
@@ -199,8 +197,7 @@ def test_a_demonstration_withdrawn_while_it_is_learnt_leaves_no_policy(
     demo = cases.add_demo(database)
 
     def withdraw() -> None:
-        with database.writing() as session:
-            withdraw_demo(session, demo.sha256, "test")
+        commit(database, withdraw_demo, demo.sha256, "test")
 
     interrupted(monkeypatch, withdraw)
     job = cases.work(database, cases.ask_training(database, release=True))
@@ -213,8 +210,7 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
     job = cases.ask_training(database)
 
     def erase() -> None:
-        with database.writing() as session:
-            erase_surgeon(session, "kestrel", "test")
+        commit(database, erase_surgeon, "kestrel", "test")
 
     interrupted(monkeypatch, erase)
     with database.writing() as session:

@@ -42,12 +42,9 @@ WAITING = text("SELECT count(*) FROM pg_stat_activity WHERE datname = current_da
 
 @pytest.fixture
 def database(tmp_path: Path) -> Iterator[Database]:
-    url = backends.fresh("postgresql", tmp_path)
-    database = Database(url)
-    cases.add_surgeon(database)
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.fresh("postgresql", tmp_path)) as database:
+        cases.add_surgeon(database)
+        yield database
 
 
 def in_turn(

@@ -1,6 +1,6 @@
 """Outcomes of demonstrations: who may learn from a failure, and what a mark ends."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -31,7 +31,7 @@ from skills.schemas.policies import GateRefusal
 from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
-from tests.library.cases import wrong
+from tests.library.cases import fetch, wrong
 from tests.library.styles import ask_retraining, counted, finish, look, retrain, served, styles_of
 
 WHY = "The needle fell."
@@ -147,8 +147,7 @@ def test_what_failed_is_learnt_from_only_if_told(database: Database, outcome: st
     mark(database, good, "failure")
     with pytest.raises(Conflict, match=r"Every active demonstration .* is marked recovery or failure"):
         cases.ask_training(database)
-    with database.reading() as session:
-        assert newest_demo(session, good.surgeon_row, cases.SUTURE) is None
+    assert fetch(database, newest_demo, good.surgeon_row, cases.SUTURE) is None
 
 
 def test_a_training_of_successes_keeps_identity_and_manifest(database: Database):
@@ -355,38 +354,30 @@ def test_a_failure_is_compared_only_if_named_and_in_no_percentile(database: Data
 # ---- backups
 
 
-def restored(database: Database, folder: Path, *, listed: bool = True) -> Database:
-    """Restore `b.zip` into a new database of the other back end."""
-    other = {"sqlite": "postgresql", "postgresql": "sqlite"}[database.engine.dialect.name]
-    made = Database(backends.blank(other, folder))
-    keep_erasures(database, folder / "list.json")
-    how = [read_erasures(str(folder / "list.json"))] if listed else []
-    assert restore(made, folder / "b.zip", *how).demos_marked == (1 if listed else 0)
-    return made
-
-
-def test_a_mark_made_after_the_backup_is_made_again(database: Database, tmp_path: Path):
+def test_a_mark_made_after_the_backup_is_made_again(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
     demo, other = add(database), add(database, 1.0)
     mark(database, other, "recovery", "Dr Doe slipped.")
     version = cases.train(database, demos=[demo.sha256], release=True)
     back_up(database, tmp_path / "b.zip")
     mark(database, demo, "failure", "Dr Doe slipped again.")
-    after = restored(database, tmp_path)
-    try:
-        assert served(after) == []
-        with after.reading() as session:
-            outcomes = {one.sha256: one.outcome for one in session.scalars(select(Demonstration))}
-        assert outcomes == {demo.sha256: "failure", other.sha256: "recovery"}
-        with pytest.raises(Conflict, match="was marked failure"):
-            cases.release(after, version)
-        assert wrong(after) == []
-        assert "Doe" not in (tmp_path / "list.json").read_text()
-    finally:
-        after.close()
-        backends.drop(after.url)
+    keep_erasures(database, tmp_path / "list.json")
+    after = empty(backends.OTHER[database.engine.dialect.name])
+    assert restore(after, tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json"))).demos_marked == 1
+    assert served(after) == []
+    with after.reading() as session:
+        outcomes = {one.sha256: one.outcome for one in session.scalars(select(Demonstration))}
+    assert outcomes == {demo.sha256: "failure", other.sha256: "recovery"}
+    with pytest.raises(Conflict, match="was marked failure"):
+        cases.release(after, version)
+    assert wrong(after) == []
+    assert "Doe" not in (tmp_path / "list.json").read_text()
 
 
-def test_a_mark_taken_back_before_the_list_is_not_made_again(database: Database, tmp_path: Path):
+def test_a_mark_taken_back_before_the_list_is_not_made_again(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
     demo = add(database)
     cases.train(database, release=True)
     back_up(database, tmp_path / "b.zip")
@@ -396,9 +387,8 @@ def test_a_mark_taken_back_before_the_list_is_not_made_again(database: Database,
     keep_erasures(database, tmp_path / "list.json")
     listed = read_erasures(str(tmp_path / "list.json"))
     assert [outcome for _, outcome in listed.outcomes.values()] == ["success"]
-    after = Database(backends.blank("sqlite", tmp_path))
+    after = empty("sqlite")
     assert restore(after, tmp_path / "b.zip", listed).demos_marked == 0
     with after.reading() as session:
         assert session.scalars(select(Demonstration)).one().outcome is None
     assert served(after) == []  # the mark withdrew it, and the list never releases
-    after.close()

@@ -23,7 +23,6 @@ from skills.formats.parsed import ParsedContent, parse, parse_recording
 from skills.library.comparison import scores
 from skills.library.operation import views
 from skills.library.operation.backup import back_up, restore
-from skills.library.operation.inspection import inspect_installation
 from skills.library.people.erasure import erase_surgeon
 from skills.library.recordings import content_cache, recordings
 from skills.library.recordings.content_cache import alike, entry_of, put_entry
@@ -37,6 +36,7 @@ from tests.by_day import some
 from tests.formats import bags, lerobots, trials
 from tests.formats.test_confined import same
 from tests.library import cases
+from tests.library.cases import commit, fetch, wrong
 
 TABLE = cases.hand_off()
 CUT = DemoIn(surgeon="kestrel", suture=cases.SUTURE, start_s=0.1, end_s=1.0)
@@ -73,17 +73,11 @@ def counted(database: Database) -> tuple[int, int]:
         return tuple(session.scalar(select(func.count()).select_from(one)) for one in (ParsedRecording, ParsedChunk))
 
 
-def faults(database: Database, **how: Any) -> list[tuple[str, str]]:
-    parts = {id(part): part for part in list(inspect_installation(database, **how))}.values()
-    return [one for part in parts for one in part.wrong]
-
-
 # ---- use -------------------------------------------------------------------------------------------------------------
 
 
 def test_cutting_scoring_and_the_page_do_not_decode_a_stored_recording(database: Database):
-    with database.writing() as session:
-        cases.agree(session, {"uses": ["atlas"], "until": None})
+    commit(database, cases.agree, {"uses": ["atlas"], "until": None})
     sha256 = add(database)
     asked = ScoreIn(surgeon="kestrel", suture=cases.SUTURE, recording=sha256, start_s=0.0, end_s=0.9)
 
@@ -114,8 +108,7 @@ def kinds() -> dict[str, tuple[bytes, dict[str, Any]]]:
 def test_the_cached_content_is_the_decoded_one_to_the_last_bit(database: Database, kind: str):
     data, reading = kinds()[kind]
     sha256 = add(database, data, **reading)
-    with database.reading() as session:
-        stored = recordings.find_recording(session, sha256)
+    stored = fetch(database, recordings.find_recording, sha256)
     decoded = parse_recording(io.BytesIO(data), **stored.reading.options)
     assert same(decoded, stored_recording(database, sha256, never))
     assert recordings.describe_recording(stored).format == stored.format == decoded.recording.format
@@ -173,14 +166,13 @@ def test_a_changed_entry_is_never_used_and_is_replaced(database: Database, damag
     told = stored_recording(database, sha256, counting(decoded))
     assert len(decoded) == 1 and same(told, decoded[0])
     assert same(told, stored_recording(database, sha256, never))
-    assert faults(database) == []
+    assert wrong(database) == []
 
 
 def test_a_damaged_entry_is_logged_and_found_by_verify(database: Database, caplog: pytest.LogCaptureFixture):
     sha256 = add(database)
-    with database.writing() as session:
-        damage_chunk(session)
-    ((where, why),) = faults(database)
+    commit(database, damage_chunk)
+    ((where, why),) = wrong(database)
     assert where == "parsed_recordings 1" and why.startswith("The entry does not match its digest")
     caplog.clear()
     content_cache.log.disabled = False  # import-linter, in another test, disables all loggers
@@ -237,18 +229,18 @@ def replace_entry(database: Database, sha256: str, told: ParsedContent) -> None:
 
 def test_verify_compares_the_newest_content_or_all_with_the_bytes(database: Database):
     first, second = add(database), add(database, cases.hand_off((2.5, 0.0, 0.0)))
-    assert faults(database, decode_all=True) == []
+    assert wrong(database, decode_all=True) == []
     false = parse(parse_recording(io.BytesIO(cases.hand_off((0.0, 2.5, 0.0)))).recording)
     replace_entry(database, first, false)
-    assert faults(database) == []
-    assert faults(database, decode_all=True) == [
+    assert wrong(database) == []
+    assert wrong(database, decode_all=True) == [
         (
             "recordings 1",
             "its cached content differs from its bytes; delete its row of parsed_recordings, which is written again",
         )
     ]
     replace_entry(database, second, false)
-    assert [where for where, _ in faults(database)] == ["recordings 2"]
+    assert [where for where, _ in wrong(database)] == ["recordings 2"]
 
 
 def test_contents_are_alike_within_rounding_and_in_nothing_else():
@@ -355,8 +347,7 @@ def test_erasing_a_surgeon_keeps_anothers_episode_of_one_dataset(database: Datab
             add_demo(database, episodes[surgeon], cut, "test", never)
     told = {surgeon: stored_recording(database, sha256, never) for surgeon, sha256 in episodes.items()}
     assert [len(one.recording.motions[0].stamps_ns) for one in told.values()] == list(lerobots.COUNTS[:2])
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    commit(database, erase_surgeon, "kestrel", "test")
     with pytest.raises(NotFound):
         stored_recording(database, episodes["kestrel"])
     assert same(told["heron"], stored_recording(database, episodes["heron"], never))
@@ -364,4 +355,4 @@ def test_erasing_a_surgeon_keeps_anothers_episode_of_one_dataset(database: Datab
         (left,) = session.scalars(select(StoredRecording))
         assert b"".join(recordings.recording_bytes(session, left))
     assert counted(database) == (1, 1)
-    assert faults(database) == []
+    assert wrong(database) == []

@@ -267,13 +267,9 @@ def test_a_backup_holds_the_pose_styles(database: Database, tmp_path: Path):
     add(database, turning())
     cases.train(database)
     back_up(database, tmp_path / "all.zip")
-    other = Database(backends.blank("postgresql" if database.engine.dialect.name == "sqlite" else "sqlite", tmp_path))
-    try:
+    with backends.opened(backends.blank(backends.OTHER[database.engine.dialect.name], tmp_path)) as other:
         restore(other, tmp_path / "all.zip")
         assert (stored(other), wrong(other)) == (1, [])
-    finally:
-        other.close()
-        backends.drop(other.url)
 
 
 @pytest.mark.parametrize("changed", ["sha256 = 'e' || substr(sha256, 2)", "policy_row = 1"])

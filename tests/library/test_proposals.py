@@ -21,6 +21,7 @@ from skills.library.recordings.recordings import store_recording
 from skills.seeds.recordings import sample_recordings
 from tests import backends
 from tests.library import cases
+from tests.library.cases import commit, fetch
 
 FIVE = next(one for one in sample_recordings() if len(one.segments) == 5)
 MCAP = "application/vnd.mcap"
@@ -29,15 +30,12 @@ MCAP = "application/vnd.mcap"
 @pytest.fixture(params=backends.BACKENDS)
 def five(request: pytest.FixtureRequest, tmp_path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Database]:
     """Yield a database with a recording of five proposals, sent for kestrel, and one of a single proposal of nobody."""
-    url = backends.fresh(request.param, tmp_path)
-    database = Database(url)
-    for surgeon in ("kestrel", "heron"):
-        cases.add_surgeon(database, surgeon)
-    store_recording(database, cases.upload(FIVE.data, MCAP), "anna", surgeon="kestrel")
-    store_recording(database, cases.upload(cases.bag("PSM1", "PSM2"), MCAP), "bert")
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.fresh(request.param, tmp_path)) as database:
+        for surgeon in ("kestrel", "heron"):
+            cases.add_surgeon(database, surgeon)
+        store_recording(database, cases.upload(FIVE.data, MCAP), "anna", surgeon="kestrel")
+        store_recording(database, cases.upload(cases.bag("PSM1", "PSM2"), MCAP), "bert")
+        yield database
 
 
 def listed(database: Database, limit: int = 200, **asked: str) -> list[Proposal]:
@@ -45,8 +43,7 @@ def listed(database: Database, limit: int = 200, **asked: str) -> list[Proposal]
     found: list[Proposal] = []
     after = None
     for _ in range(100):
-        with database.reading() as session:
-            page, after = list_proposals(session, limit, after, **asked)
+        page, after = fetch(database, list_proposals, limit, after, **asked)
         found += page
         if after is None:
             return found
@@ -58,8 +55,7 @@ def numbered(found: list[Proposal]) -> list[tuple[str, int]]:
 
 
 def mark(database: Database, recording: str, number: int, state: str, note: str | None = None) -> Proposal:
-    with database.writing() as session:
-        return decide(session, recording, number, state, note, "anna")
+    return commit(database, decide, recording, number, state, note, "anna")
 
 
 def cut(database: Database, one: Proposal, surgeon: str = "kestrel", late_s: float = 0.0) -> str:
@@ -98,8 +94,7 @@ def test_a_cut_accepts_its_proposal_and_a_rejection_stays(five: Database):
     with pytest.raises(Conflict, match="was accepted"):
         mark(five, recording, 1, "rejected")
     assert mark(five, recording, 2, "open").state == "open"
-    with five.writing() as session:
-        withdraw_demo(session, demo, "anna")
+    commit(five, withdraw_demo, demo, "anna")
     assert states(five, recording)[0] == "accepted"  # a withdrawn cut cannot be made again
     for number in (0, 6):
         with pytest.raises(NotFound, match="it has 5"):
@@ -116,8 +111,7 @@ def test_decisions_are_deleted_with_their_recording(five: Database):
     (first, *_, other) = listed(five)[2:3] + listed(five)[:1]
     for one in (first, other):
         mark(five, one.recording.sha256, 1, "rejected", "by a name")
-    with five.writing() as session:
-        erase_surgeon(session, "kestrel", "anna")
+    commit(five, erase_surgeon, "kestrel", "anna")
     with five.writing() as session:
         assert session.scalars(select(ProposalMark.recording_row)).all() == [other.recording.row]
         delete_recording(session, other.recording.sha256, "bert", as_admin=False)

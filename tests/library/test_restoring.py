@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import timedelta
 from functools import partialmethod
 from pathlib import Path
@@ -31,26 +31,22 @@ from skills.serving import keeping_erasures
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
+from tests.library.cases import commit
 
-OTHER = {"sqlite": "postgresql", "postgresql": "sqlite"}
 BOTH = {"uses": ["training", "export"], "until": None}
 
 
 @pytest.fixture
-def restored(database: Database, tmp_path: Path) -> Iterator[Callable[[], Database]]:
+def restored(database: Database, empty: Callable[[str], Database], tmp_path: Path) -> Callable[[], Database]:
     """Restore `b.zip` with the list of endings in `database` since, into a database of the other back end."""
-    made: list[Database] = []
 
     def make() -> Database:
-        made.append(Database(backends.blank(OTHER[database.engine.dialect.name], tmp_path)))
+        made = empty(backends.OTHER[database.engine.dialect.name])
         keep_erasures(database, tmp_path / "list.json")
-        restore(made[-1], tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json")))
-        return made[-1]
+        restore(made, tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json")))
+        return made
 
-    yield make
-    for one in made:
-        one.close()
-        backends.drop(one.url)
+    return make
 
 
 def served(database: Database) -> str | None:
@@ -75,8 +71,7 @@ def whole(database: Database) -> bool:
 
 def test_erasing_what_is_served_never_lets_an_older_release_come_back(database: Database):
     _, second = two_releases(database)
-    with database.writing() as session:
-        erase_demo(session, second, "test")
+    commit(database, erase_demo, second, "test")
     assert served(database) is None
 
 
@@ -136,8 +131,7 @@ def test_what_ended_and_was_allowed_again_before_the_backup_stands(
     assert served(after) == policy.sha256
     with after.reading() as session:
         assert find_surgeon(session, "kestrel").consent == Consent.model_validate(BOTH)
-    with database.writing() as session:
-        erase_demo(session, demo, "test")
+    commit(database, erase_demo, demo, "test")
     again = restored()
     with again.reading() as session:
         assert session.scalars(select(Demonstration)).all() == []
@@ -153,8 +147,7 @@ def test_a_deleted_recording_that_is_used_again_does_not_block_a_restore(
 ):
     back_up(database, tmp_path / "b.zip")
     sent, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
-    with database.writing() as session:
-        delete_recording(session, sent.sha256, "test", as_admin=True)
+    commit(database, delete_recording, sent.sha256, "test", as_admin=True)
     again = restored()  # it knows nothing of the deletion; the list does
     cases.add_surgeon(again)
     demo = cases.add_demo(again).sha256
@@ -173,8 +166,7 @@ def test_a_recording_deleted_after_the_backup_is_deleted_again(
         for shift in (0.0, 1.0)
     )
     back_up(database, tmp_path / "b.zip")
-    with database.writing() as session:
-        delete_recording(session, gone, "test", as_admin=True)
+    commit(database, delete_recording, gone, "test", as_admin=True)
     with restored().reading() as session:
         assert session.scalars(select(StoredRecording.sha256)).all() == [kept]
 
@@ -183,8 +175,7 @@ def test_a_key_that_was_revoked_stays_revoked(database: Database, restored: Call
     with database.writing() as session:
         ids = [create_key(session, owner, "reader", "test")[0].id for owner in ("anna", "bert")]
     back_up(database, tmp_path / "b.zip")
-    with database.writing() as session:
-        revoke_key(session, ids[0], "test")
+    commit(database, revoke_key, ids[0], "test")
     with restored().reading() as session:
         assert {key.id: key.revoked_at is None for key in session.scalars(select(Key))} == {ids[0]: False, ids[1]: True}
 
@@ -203,11 +194,9 @@ def test_a_key_that_was_revoked_stays_revoked(database: Database, restored: Call
 def test_a_consent_that_was_narrowed_stays_narrow_and_none_is_widened(
     before: Any, after: Any, left: Any, database: Database, restored: Callable[[], Database], tmp_path: Path
 ):
-    with database.writing() as session:
-        put_surgeon(session, "kestrel", SurgeonIn.model_validate({"consent": before, "protocol": "IRB 1"}), "test")
+    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate({"consent": before, "protocol": "IRB 1"}), "test")
     back_up(database, tmp_path / "b.zip")
-    with database.writing() as session:
-        put_surgeon(session, "kestrel", SurgeonIn.model_validate({"consent": after, "protocol": "IRB 1"}), "test")
+    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate({"consent": after, "protocol": "IRB 1"}), "test")
     with restored().reading() as session:
         surgeon = find_surgeon(session, "kestrel")
         assert (surgeon.consent, surgeon.protocol) == (Consent.model_validate(left), "IRB 1")
@@ -235,14 +224,12 @@ def test_the_service_keeps_the_list_up_while_it_runs(database: Database, tmp_pat
     file = tmp_path / "kept" / "erasures.json"
     with keeping_erasures(Settings(database_url=database.url, erasures_file=file)):
         assert read_erasures(str(file)).demos == set()
-        with database.writing() as session:
-            erase_demo(session, demo, "test")
+        commit(database, erase_demo, demo, "test")
         deadline_s = time.monotonic() + 60
         while read_erasures(str(file)).demos != {demo}:
             assert time.monotonic() < deadline_s
             time.sleep(0.05)
-        with database.writing() as session:
-            erase_surgeon(session, "kestrel", "test")
+        commit(database, erase_surgeon, "kestrel", "test")
     assert len(read_erasures(str(file)).surgeons) == 1  # written once more at the end
 
 

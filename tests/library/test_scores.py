@@ -21,6 +21,7 @@ from skills.schemas.people import SurgeonIn
 from skills.schemas.scores import Score, ScoreIn
 from skills.scoring.calibration import SkillModel, as_numbers
 from tests.library import cases, rated
+from tests.library.cases import commit
 from tests.scoring.test_rating import JUDGED as RATED
 from tests.scoring.test_rating import model
 
@@ -145,8 +146,7 @@ def test_overlapping_cuts_of_one_motion_count_once(database: Database) -> None:
     novice = next(one for one in told.percentiles if one.level == "novice")
     assert (novice.demos, novice.surgeons) == (LEAST_DEMOS, 1)  # none of the motion's own cuts
     assert [one.demo for one in told.curve] == [mine.sha256]
-    with database.writing() as session:
-        withdraw_demo(session, mine.sha256, "test")
+    commit(database, withdraw_demo, mine.sha256, "test")
     novice = next(one for one in scored(database, another).percentiles if one.level == "novice")
     assert novice.demos == LEAST_DEMOS
 
@@ -159,8 +159,7 @@ def test_a_newer_cut_that_failed_does_not_hide_one_that_did_not(database: Databa
     tip_mm = cases.points_mm(samples=40)
     cases.add_demo(database, cases.table(tip_mm), "wren")
     failed = cases.add_demo(database, cases.table(tip_mm), "wren", start_s=0.1)
-    with database.writing() as session:
-        mark_demo(session, failed.sha256, "failure", "The needle fell.", "test")
+    commit(database, mark_demo, failed.sha256, "failure", "The needle fell.", "test")
     put(database, "plover")
     told = scored(database, bent(20.0, "plover", database))
     (novice,) = (one for one in told.percentiles if one.level == "novice")
@@ -236,8 +235,7 @@ def test_what_cannot_be_scored_is_refused(database: Database) -> None:
         scored(database, interrupted)
     with pytest.raises(BadInput, match="of another style"):
         scored(database, mine, reference=mine.sha256)
-    with database.writing() as session:
-        withdraw_demo(session, reference.sha256, "test")
+    commit(database, withdraw_demo, reference.sha256, "test")
     with pytest.raises(Conflict, match="reference was withdrawn"):
         scored(database, mine, reference=reference.sha256)
     with pytest.raises(Conflict, match="demonstration was withdrawn"):

@@ -1,6 +1,6 @@
 """Uploads in pieces, erasures in steps, retentions, and batches whose styles are added in steps."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any
@@ -9,24 +9,13 @@ import pytest
 from sqlalchemy import func, select, text, update
 from sqlalchemy.orm import Session
 
-from skills.db import now
-from skills.db.models import (
-    LooseChunks,
-    ParsedChunk,
-    ParsedRecording,
-    Plan,
-    RecordingChunk,
-    StoredPictures,
-    StoredPlayback,
-    StoredRecording,
-)
+from skills.db import models, now
 from skills.db.service_tables import ErasedSurgeon, Event, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Busy, NotFound
 from skills.formats.parsed import parse_recording
 from skills.library.operation import sweep
-from skills.library.operation.inspection import inspect_installation
-from skills.library.operation.jobs import find_job, identity_of, list_jobs
+from skills.library.operation.jobs import cancel, find_job, identity_of, list_jobs
 from skills.library.operation.sweep import STEADY_S, SteadyClock, drop_contents, sweep_erased
 from skills.library.people.erasure import delete_recording, erase_surgeon
 from skills.library.plans.plans import planned, trajectory_of
@@ -37,7 +26,8 @@ from skills.settings import Settings
 from skills.verification.playback import Pictures
 from tests.db.test_query_plans import noted
 from tests.library import cases
-from tests.library.styles import ask_retraining, finish, look, parts_of
+from tests.library.cases import commit
+from tests.library.styles import ask_retraining, counted, finish, look, parts_of
 from tests.library.test_pictures import store_playback
 from tests.planning.motions import ideal_playback
 
@@ -52,11 +42,6 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(room, "AT_ONCE_BYTES", KIB)
     monkeypatch.setattr("skills.library.people.erasure.AT_ONCE_BYTES", KIB)
     monkeypatch.setattr(sweep, "JOBS_AT_ONCE", 3)
-
-
-def count(database: Database, table: type) -> int:
-    with database.reading() as session:
-        return session.scalar(select(func.count()).select_from(table)) or 0
 
 
 def settings_of(database: Database, **days: float) -> Settings:
@@ -87,11 +72,11 @@ def test_a_large_recording_is_stored_in_pieces_and_read_whole(database: Database
     stored, new = store_recording(database, cases.upload(data), "test")
     assert new
     with database.reading() as session:
-        chunks = session.scalar(select(func.count()).where(RecordingChunk.recording == stored.row))
+        chunks = session.scalar(select(func.count()).where(models.RecordingChunk.recording == stored.row))
         assert chunks == -(-len(data) // KIB) > 2
         assert b"".join(recording_bytes(session, find_recording(session, stored.sha256))) == data
-    assert count(database, LooseChunks) == 0
-    assert count(database, ParsedChunk) > 1
+    assert counted(database, models.LooseChunks) == 0
+    assert counted(database, models.ParsedChunk) > 1
     again, new = store_recording(database, cases.upload(data), "test")
     assert (again.row, new) == (stored.row, False)
 
@@ -104,17 +89,17 @@ def test_an_upload_that_dies_anywhere_leaves_nothing_to_see_and_is_swept(
     for number in range(1, before_row + 1):
         with failing_at(monkeypatch, number), pytest.raises(KeyboardInterrupt):
             store_recording(database, cases.upload(data), "test")
-        assert count(database, StoredRecording) == 0
-    left = count(database, RecordingChunk)
+        assert counted(database, models.StoredRecording) == 0
+    left = counted(database, models.RecordingChunk)
     sweep_erased(database)
-    assert count(database, RecordingChunk) == left > 0, "an upload under way is left alone"
-    assert not [one for one in inspect_installation(database) if one.wrong]
+    assert counted(database, models.RecordingChunk) == left > 0, "an upload under way is left alone"
+    assert not cases.wrong(database)
     with database.writing() as session:
-        session.execute(update(LooseChunks).values(due_at=now()))
+        session.execute(update(models.LooseChunks).values(due_at=now()))
     sweep_erased(database)
-    assert (count(database, RecordingChunk), count(database, LooseChunks)) == (0, 0)
+    assert (counted(database, models.RecordingChunk), counted(database, models.LooseChunks)) == (0, 0)
     store_recording(database, cases.upload(data), "test")
-    assert count(database, StoredRecording) == 1
+    assert counted(database, models.StoredRecording) == 1
 
 
 def test_pieces_that_were_swept_are_not_continued(database: Database, small: None, monkeypatch: pytest.MonkeyPatch):
@@ -125,13 +110,13 @@ def test_pieces_that_were_swept_are_not_continued(database: Database, small: Non
     def late(session: Session, row: int, number: int, piece: bytes) -> int:
         if not swept:
             swept.append(1)
-            session.execute(update(LooseChunks).values(due_at=now() - timedelta(seconds=1)))
+            session.execute(update(models.LooseChunks).values(due_at=now() - timedelta(seconds=1)))
         return add(session, row, number, piece)
 
     monkeypatch.setattr(recordings, "_add_chunks", late)
     with pytest.raises(Busy, match="send it again"):
         store_recording(database, upload, "test")
-    assert count(database, StoredRecording) == 0
+    assert counted(database, models.StoredRecording) == 0
 
 
 def test_a_content_half_cached_is_not_used_and_is_completed(
@@ -140,27 +125,26 @@ def test_a_content_half_cached_is_not_used_and_is_completed(
     stored, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
     told = stored_recording(database, stored.sha256)
     with database.writing() as session:
-        session.execute(update(ParsedRecording).values(version=content_cache.UNFINISHED))
+        session.execute(update(models.ParsedRecording).values(version=content_cache.UNFINISHED))
         session.execute(text("DELETE FROM parsed_chunks WHERE number = 1"))
-    chunks = count(database, ParsedChunk)
+    chunks = counted(database, models.ParsedChunk)
     assert content_cache.alike(stored_recording(database, stored.sha256), told)
-    assert count(database, ParsedChunk) == chunks + 1
+    assert counted(database, models.ParsedChunk) == chunks + 1
     with database.reading() as session:
         assert content_cache.cached_content(session, find_recording(session, stored.sha256)) is not None
 
 
 def test_a_deleted_recording_is_gone_at_once_and_swept_later(database: Database, small: None):
     stored, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
-    with database.writing() as session:
-        delete_recording(session, stored.sha256, "test", as_admin=True)
+    commit(database, delete_recording, stored.sha256, "test", as_admin=True)
     with database.reading() as session, pytest.raises(NotFound):
         find_recording(session, stored.sha256)
-    assert count(database, RecordingChunk) > 0
+    assert counted(database, models.RecordingChunk) > 0
     again, _ = store_recording(database, cases.upload(cases.hand_off()), "test")  # with chunks of its own
     sweep_erased(database)
     with database.reading() as session:
         assert b"".join(recording_bytes(session, again)) == cases.hand_off()
-        assert session.scalars(select(RecordingChunk.recording).distinct()).all() == [again.row]
+        assert session.scalars(select(models.RecordingChunk.recording).distinct()).all() == [again.row]
 
 
 def test_cached_content_is_dropped_in_steps_and_unused_from_the_first_on(
@@ -168,17 +152,17 @@ def test_cached_content_is_dropped_in_steps_and_unused_from_the_first_on(
 ):
     data = cases.hand_off()
     stored, _ = store_recording(database, cases.upload(data), "test")
-    chunks = count(database, ParsedChunk)
+    chunks = counted(database, models.ParsedChunk)
     assert chunks > 2
     with failing_at(monkeypatch, 2), pytest.raises(KeyboardInterrupt):  # killed after the first step
         drop_contents(database, [stored.row])
-    assert count(database, ParsedChunk) == chunks - 1
+    assert counted(database, models.ParsedChunk) == chunks - 1
     assert stored_recording(database, stored.sha256).recording.duration_s > 0, "decoded, and cached again"
-    assert count(database, ParsedChunk) == chunks
+    assert counted(database, models.ParsedChunk) == chunks
     with failing_at(monkeypatch, 0) as begun:
         drop_contents(database, [stored.row, stored.row + 1])  # the second one is gone
-    assert (count(database, ParsedChunk), len(begun)) == (0, chunks + 1)
-    assert not [one for one in inspect_installation(database) if one.wrong]
+    assert (counted(database, models.ParsedChunk), len(begun)) == (0, chunks + 1)
+    assert not cases.wrong(database)
 
 
 def add_jobs(database: Database, number: int, **about: Any) -> None:
@@ -202,20 +186,19 @@ def test_an_erased_surgeons_jobs_are_gone_at_once_and_swept_later(
     cases.add_demo(database)
     cases.train(database, release=True)
     add_jobs(database, 10)
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
-    assert (count(database, Job), count(database, ErasedSurgeon)) == (11, 1)
+    commit(database, erase_surgeon, "kestrel", "test")
+    assert (counted(database, Job), counted(database, ErasedSurgeon)) == (11, 1)
     with database.reading() as session:
         assert list(list_jobs(session, 50, None, None)) == []
         with pytest.raises(NotFound):
             find_job(session, f"{9:016x}")
-    assert not [one for one in inspect_installation(database) if one.wrong]
+    assert not cases.wrong(database)
     with failing_at(monkeypatch, 3), pytest.raises(KeyboardInterrupt):  # killed in the middle
         sweep_erased(database)
-    assert count(database, Job) == 7, "one in the first step, three in the second"
+    assert counted(database, Job) == 7, "one in the first step, three in the second"
     with noted(database) as asked:
         sweep_erased(database)
-    assert (count(database, Job), count(database, ErasedSurgeon)) == (0, 0)
+    assert (counted(database, Job), counted(database, ErasedSurgeon)) == (0, 0)
     assert sum("FROM jobs" in statement for statement, _ in asked) == 1, "for all its steps together"
 
 
@@ -227,8 +210,8 @@ def test_ended_jobs_are_deleted_after_their_retention_with_their_batch(database:
     add_jobs(database, 7, ended_at=now() - timedelta(days=30))
     days = settings_of(database, keep_jobs_days=20)
     assert sweep.sweep(database, days)
-    assert count(database, StyleToRetrain) == 1, "the batch is young"
-    events = count(database, Event)
+    assert counted(database, StyleToRetrain) == 1, "the batch is young"
+    events = counted(database, Event)
     with database.writing() as session:
         session.execute(text("UPDATE jobs SET ended_at = created_at"))
         old = now() - timedelta(days=30)
@@ -237,7 +220,7 @@ def test_ended_jobs_are_deleted_after_their_retention_with_their_batch(database:
     with database.reading() as session:
         (left,) = session.scalars(select(Job)).all()
     assert left.result["sha256"] == young.sha256
-    assert (count(database, StyleToRetrain), count(database, Event)) == (0, events)
+    assert (counted(database, StyleToRetrain), counted(database, Event)) == (0, events)
 
 
 def test_a_sweep_ends_in_time_and_says_that_something_is_left(database: Database, small: None):
@@ -246,9 +229,9 @@ def test_a_sweep_ends_in_time_and_says_that_something_is_left(database: Database
     add_jobs(database, 7, ended_at=now() - timedelta(days=30))
     days = settings_of(database, keep_jobs_days=20)
     assert not sweep.sweep(database, days, at_most_s=0.0)
-    assert count(database, Job) == 5
+    assert counted(database, Job) == 5
     assert sweep.sweep(database, days)
-    assert count(database, Job) == 1
+    assert counted(database, Job) == 1
 
 
 def test_old_pictures_are_deleted_with_the_jobs_that_drew_them(database: Database, monkeypatch):
@@ -258,43 +241,51 @@ def test_old_pictures_are_deleted_with_the_jobs_that_drew_them(database: Databas
     plan = cases.add_plan(database)
     names = [f"{number:064x}" for number in range(5)]
     with database.writing() as session:
-        measured = ideal_playback(trajectory_of(planned(session.get_one(Plan, plan.row))))
+        measured = ideal_playback(trajectory_of(planned(session.get_one(models.Plan, plan.row))))
         playbacks = [store_playback(session, plan, name, measured) for name in names]
         session.execute(update(Job).where(Job.kind == "pictures").values(state="succeeded", ended_at=now()))
         for number, playback in enumerate(playbacks):
-            drawn = StoredPictures(playback_row=playback.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png"))
+            drawn = models.StoredPictures(playback_row=playback.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png"))
             drawn.created_at = now() - timedelta(days=(30, 10, 30, 30, 21)[number])
             session.add(drawn)
         last = identity_of("pictures", {"plan": plan.sha256, "playback": names[4]})
         session.execute(update(Job).where(Job.identity == last).values(state="running", ended_at=None))
     assert sweep.sweep(database, settings_of(database))
-    assert count(database, StoredPictures) == 5, "the default is a year"
+    assert counted(database, models.StoredPictures) == 5, "the default is a year"
     assert sweep.sweep(database, settings_of(database, keep_pictures_days=20))
     with database.reading() as session:
-        assert session.scalars(select(StoredPictures.playback_row)).all() == [playbacks[1].row]
+        assert session.scalars(select(models.StoredPictures.playback_row)).all() == [playbacks[1].row]
         asked = session.scalars(select(Job.request).where(Job.kind == "pictures").order_by(Job.row)).all()
         assert [one["playback"] for one in asked] == [names[1], names[4]]
         assert session.scalar(select(func.count()).where(Job.kind == "training")) == 1
-    assert count(database, StoredPlayback) == 5
+    assert counted(database, models.StoredPlayback) == 5
 
 
-def test_a_batch_does_not_end_before_all_its_styles_are_added(database: Database, monkeypatch: pytest.MonkeyPatch):
+def batch_of_two(database: Database, monkeypatch: pytest.MonkeyPatch, then: Callable[[Session, Job], None]) -> Job:
+    """Ask for a batch of two styles, which are added one by one; a callback runs after each."""
     monkeypatch.setattr(retraining, "STYLES_AT_ONCE", 1)
     cases.add_surgeon(database, "osprey")
     for slug in ("kestrel", "osprey"):
         cases.add_demo(database, surgeon=slug)
     divide = retraining._divide
 
-    def and_work(session: Session, job: Job, *styles: Any) -> None:
+    def and_then(session: Session, job: Job, *styles: Any) -> None:
         divide(session, job, *styles)
+        then(session, job)
+
+    monkeypatch.setattr(retraining, "_divide", and_then)
+    return ask_retraining(database)
+
+
+def test_a_batch_does_not_end_before_all_its_styles_are_added(database: Database, monkeypatch: pytest.MonkeyPatch):
+    def work(session: Session, job: Job) -> None:
         session.commit()
         for part in parts_of(database, job):
             if part.state == "queued":
                 cases.work(database, part)
         assert look(database, job).state == "running"
 
-    monkeypatch.setattr(retraining, "_divide", and_work)
-    assert ask_retraining(database).state == "succeeded"
+    assert batch_of_two(database, monkeypatch, work).state == "succeeded"
 
 
 def test_a_batch_whose_request_was_interrupted_fails_and_can_be_repeated(
@@ -318,21 +309,8 @@ def test_a_batch_whose_request_was_interrupted_fails_and_can_be_repeated(
 
 
 def test_a_batch_cancelled_while_styles_are_added_gets_no_more(database: Database, monkeypatch: pytest.MonkeyPatch):
-    from skills.library.operation.jobs import cancel
-
-    monkeypatch.setattr(retraining, "STYLES_AT_ONCE", 1)
-    cases.add_surgeon(database, "osprey")
-    for slug in ("kestrel", "osprey"):
-        cases.add_demo(database, surgeon=slug)
-    divide = retraining._divide
-
-    def and_cancel(session: Session, job: Job, *styles: Any) -> None:
-        divide(session, job, *styles)
-        cancel(session, job.id, "test")
-
-    monkeypatch.setattr(retraining, "_divide", and_cancel)
-    job = ask_retraining(database)
-    assert (job.state, count(database, StyleToRetrain)) == ("cancelled", 1)
+    job = batch_of_two(database, monkeypatch, lambda session, job: cancel(session, job.id, "test"))
+    assert (job.state, counted(database, StyleToRetrain)) == ("cancelled", 1)
 
 
 def test_a_small_upload_needs_one_transaction(database: Database, monkeypatch: pytest.MonkeyPatch):
@@ -354,7 +332,7 @@ def test_bytes_sent_twice_at_once_are_kept_once(database: Database, small: None)
     assert kept == [ahead[0], ahead[0]]
     sweep_erased(database)
     with database.reading() as session:
-        assert session.scalars(select(RecordingChunk.recording).distinct()).all() == [ahead[0]]
+        assert session.scalars(select(models.RecordingChunk.recording).distinct()).all() == [ahead[0]]
         assert b"".join(recording_bytes(session, find_recording(session, first.sha256))) == data
 
 
@@ -386,6 +364,6 @@ def test_without_a_steady_clock_only_erasures_are_swept(database: Database):
         session.execute(update(Job).values(ended_at=now() - timedelta(days=400)))
         session.add(ErasedSurgeon(surgeon_row=99))
     assert sweep.sweep(database, settings_of(database), by_age=False)
-    assert (count(database, Job), count(database, ErasedSurgeon)) == (1, 0)
+    assert (counted(database, Job), counted(database, ErasedSurgeon)) == (1, 0)
     assert sweep.sweep(database, settings_of(database))
-    assert count(database, Job) == 0, ended.id
+    assert counted(database, Job) == 0, ended.id

@@ -23,11 +23,8 @@ NOT_OURS = "jobs_of_the_engine"
 @pytest.fixture(params=backends.BACKENDS)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
     """Yield a database without any table."""
-    url = backends.blank(request.param, tmp_path)
-    database = Database(url)
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.blank(request.param, tmp_path)) as database:
+        yield database
 
 
 def tables(database: Database) -> set[str]:

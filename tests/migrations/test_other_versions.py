@@ -26,14 +26,11 @@ REFUSED = "This database was made by another version of suture-skills"
 @pytest.fixture(params=backends.BACKENDS)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
     """Yield a database with a released policy."""
-    url = backends.fresh(request.param, tmp_path)
-    database = Database(url)
-    cases.add_surgeon(database)
-    cases.add_demo(database)
-    cases.train(database, release=True)
-    yield database
-    database.close()
-    backends.drop(url)
+    with backends.opened(backends.fresh(request.param, tmp_path)) as database:
+        cases.add_surgeon(database)
+        cases.add_demo(database)
+        cases.train(database, release=True)
+        yield database
 
 
 @pytest.mark.parametrize("commands", [1, pytest.param(4, marks=pytest.mark.nightly)])

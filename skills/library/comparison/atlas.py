@@ -9,6 +9,7 @@ sample. Of overlapping cuts of one motion the newest counts. It uses distances i
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -16,27 +17,13 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from skills.arrays import Floats, Ints
-from skills.comparison.distances import (
-    LEAST_MM,
-    STATES,
-    WORTH,
-    Dendrogram,
-    Difference,
-    chart,
-    dendrogram,
-    difference,
-    how_many,
-    in_lengths,
-    medoid,
-    silhouette,
-    spread,
-)
+from skills.comparison import distances
 from skills.db.models import Demonstration, SutureType
 from skills.db.session import Database
 from skills.errors import BadPath, Conflict, NotFound
 from skills.library.comparison.measuring import far_apart
 from skills.library.comparison.members import Member, comparable_demo, members_of, sessions_of, without_overlaps
-from skills.library.comparison.recognition import recognise_arms, recognise_demo, recognitions, votes
+from skills.library.comparison.recognition import Recognised, recognise_arms, recognise_demo, recognitions, votes
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import shares_served
 from skills.schemas import comparison as described
@@ -47,15 +34,17 @@ DIGITS = 4  # of the rounded results: a tenth of a micrometre, far below the res
 UNITS = {False: "mm", True: "lengths of start to goal"}
 
 AS_ASKED = "as asked"
-BY_SILHOUETTE = f"that with the best mean silhouette, and one where even that is below {WORTH:g}"
+BY_SILHOUETTE = f"that with the best mean silhouette, and one where even that is below {distances.WORTH:g}"
 
 OVERLAPPED = (
     "A newer cut of the same motion counts: it shares at least half of the shorter one's time, in the same recording."
 )
-NO_DIRECTION = f"It ends within {LEAST_MM:g} mm of where it began, so it has no direction and cannot be compared."
+NO_DIRECTION = (
+    f"It ends within {distances.LEAST_MM:g} mm of where it began, so it has no direction and cannot be compared."
+)
 DISTANCE = (
-    f"A distance is the total of dynamic time warping (Manhattan) of two shapes of {STATES} states, divided by "
-    f"{STATES}: about the mean difference of two motions at one place. All shapes have the same start and "
+    f"A distance is the total of dynamic time warping (Manhattan) of two shapes of {distances.STATES} states, divided "
+    f"by {distances.STATES}: about the mean difference of two motions at one place. All shapes have the same start and "
     "direction."
 )
 CONFOUNDED = (
@@ -106,11 +95,12 @@ def atlas_of(
     if not members:
         raise NotFound(" ".join([f"There is no demonstration of '{suture}' to compare.", *left_out.because]))
     if scaled:
-        shapes, far = np.array([in_lengths(shape) for shape in apart.shapes_mm]), apart.apart_scaled
+        shapes, far = np.array([distances.in_lengths(shape) for shape in apart.shapes_mm]), apart.apart_scaled
     else:
         shapes, far = apart.shapes_mm, apart.apart_mm
-    compared = _compare(members, shapes, far / STATES, scaled, apart.signatures, found.shares)
-    return _atlas(suture, compared, left_out, clusters, found.asked)
+    slugs, surgeon_of = np.unique([one.surgeon for one in members], return_inverse=True)
+    compared = _Compared(members, shapes, far / distances.STATES, scaled, slugs.tolist(), surgeon_of, found.shares)
+    return _atlas(suture, compared, recognise_arms(members, apart.signatures), left_out, clusters, found.asked)
 
 
 @dataclass(frozen=True)
@@ -159,26 +149,22 @@ def _asked(session: Session, demo: str, suture: str) -> str:
 
 
 def _left_out(found: _Found, without_direction: list[str]) -> described.LeftOutOfAtlas:
-    because = []
-    if found.without_consent:
-        because.append(
-            f"Left out: {_count(found.without_consent)}, because the surgeon's consent does not cover an atlas."
-        )
-    if without_direction:
-        because.append(f"Left out: {_count(len(without_direction))}. {NO_DIRECTION}")
-    if found.overlapped:
-        because.append(f"Left out: {_count(len(found.overlapped))}. {OVERLAPPED}")
-    if found.not_sampled:
-        because.append(
-            f"Left out: {_count(found.not_sampled)}. An atlas shows {MOST} at the most, drawn at random by their "
-            "digests; the nearest neighbours of a demonstration are searched among all."
-        )
+    sampled = (
+        f". An atlas shows {MOST} at the most, drawn at random by their digests; the nearest neighbours of a "
+        "demonstration are searched among all."
+    )
+    reasons = (
+        (found.without_consent, ", because the surgeon's consent does not cover an atlas."),
+        (len(without_direction), f". {NO_DIRECTION}"),
+        (len(found.overlapped), f". {OVERLAPPED}"),
+        (found.not_sampled, sampled),
+    )
     return described.LeftOutOfAtlas(
         without_consent=found.without_consent,
         without_direction=without_direction,
         overlapped=[one.sha256 for one in found.overlapped],
         not_sampled=found.not_sampled,
-        because=because,
+        because=[f"Left out: {_count(demos)}{why}" for demos, why in reasons if demos],
     )
 
 
@@ -188,7 +174,7 @@ def _count(demos: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """Members with the distances between all of them, and the surgeon and session of each as numbers."""
+    """Members with the distances between all of them, and the surgeon of each as a number."""
 
     members: Sequence[Member]
     shapes: Floats
@@ -196,9 +182,12 @@ class _Compared:
     scaled: bool
     surgeons: list[str]
     surgeon_of: Ints
-    sessions: Ints
-    signatures: Floats
     shares: Mapping[str, float]
+
+    @cached_property
+    def sessions(self) -> Ints:
+        """The session of each as a number."""
+        return sessions_of(self.members)
 
     def of(self, surgeon: int) -> Ints:
         """Return the indices of a surgeon's demonstrations."""
@@ -209,27 +198,19 @@ class _Compared:
         return self.members[one].sha256
 
 
-def _compare(
-    members: Sequence[Member],
-    shapes: Floats,
-    far: Floats,
-    scaled: bool,
-    signatures: Floats,
-    shares: Mapping[str, float],
-) -> _Compared:
-    slugs, surgeons = np.unique([one.surgeon for one in members], return_inverse=True)
-    return _Compared(members, shapes, far, scaled, slugs.tolist(), surgeons, sessions_of(members), signatures, shares)
-
-
 def _atlas(
-    suture: str, compared: _Compared, left_out: described.LeftOutOfAtlas, clusters: int | None, asked: str | None
+    suture: str,
+    compared: _Compared,
+    recognised: Recognised,
+    left_out: described.LeftOutOfAtlas,
+    clusters: int | None,
+    asked: str | None,
 ) -> described.Atlas:
     far, members = compared.far, compared.members
-    tree = dendrogram(far)
-    number = clusters or how_many(far, tree)
+    tree = distances.dendrogram(far)
+    number = clusters or distances.how_many(far, tree)
     in_cluster = tree.cut(number)
-    places, shows = chart(far)
-    recognised = recognise_arms(members, compared.signatures)
+    places, shows = distances.chart(far)
     of_asked = next((one for one in members if one.sha256 == asked), None)
     return described.Atlas(
         suture=suture,
@@ -246,7 +227,7 @@ def _atlas(
         order=tree.order.tolist(),
         clusters=[_cluster(compared, one, np.flatnonzero(in_cluster == one)) for one in range(number)],
         clusters_chosen=AS_ASKED if clusters else BY_SILHOUETTE,
-        silhouette=round(silhouette(far, in_cluster), DIGITS) if number > 1 else None,
+        silhouette=round(distances.silhouette(far, in_cluster), DIGITS) if number > 1 else None,
         chart_shows=round(shows, DIGITS),
         surgeons=[_consistency(compared, one) for one in range(len(compared.surgeons))],
         differences=_differences(compared),
@@ -258,7 +239,7 @@ def _atlas(
     )
 
 
-def _merges(tree: Dendrogram) -> list[described.Merge]:
+def _merges(tree: distances.Dendrogram) -> list[described.Merge]:
     sizes = [1] * len(tree.order)
     merges = []
     for (one, other), height in zip(tree.joined.tolist(), tree.heights.round(DIGITS).tolist(), strict=True):
@@ -272,7 +253,7 @@ def _cluster(compared: _Compared, cluster: int, members: Ints) -> described.Clus
     return described.Cluster(
         cluster=cluster + 1,
         demos=len(members),
-        medoid=compared.name(medoid(compared.far, members)),
+        medoid=compared.name(distances.medoid(compared.far, members)),
         spread=_spread(compared.far, members),
         surgeons=[described.SurgeonCount(surgeon=surgeon, demos=demos) for surgeon, demos in counts.most_common()],
     )
@@ -286,29 +267,29 @@ def _consistency(compared: _Compared, surgeon: int) -> described.Consistency:
         demos=len(mine),
         recordings=len({compared.members[one].recording_row for one in mine.tolist()}),
         sessions=len(np.unique(compared.sessions[mine])),
-        medoid=compared.name(medoid(compared.far, mine)),
+        medoid=compared.name(distances.medoid(compared.far, mine)),
         spread=_spread(compared.far, mine),
         mean_share=None if share is None else round(share, DIGITS),
     )
 
 
 def _spread(far: Floats, members: Ints) -> float | None:
-    return round(spread(far, members), DIGITS) if len(members) > 1 else None
+    return round(distances.spread(far, members), DIGITS) if len(members) > 1 else None
 
 
 def _differences(compared: _Compared) -> list[described.SurgeonDifference]:
     """Compare the surgeons with the most demonstrations, pair by pair."""
     counts = np.bincount(compared.surgeon_of)
     most = sorted(np.argsort(-counts, kind="stable")[:MOST_COMPARED].tolist())
-    medoids = {one: medoid(compared.far, compared.of(one)) for one in most}
+    medoids = {one: distances.medoid(compared.far, compared.of(one)) for one in most}
     return [_apart(compared, one, other, medoids[one], medoids[other]) for one, other in combinations(most, 2)]
 
 
 def _apart(compared: _Compared, one: int, other: int, of_one: int, of_other: int) -> described.SurgeonDifference:
-    found = difference(compared.shapes[of_one], compared.shapes[of_other])
+    found = distances.difference(compared.shapes[of_one], compared.shapes[of_other])
     names = compared.surgeons[one], compared.surgeons[other]
     (part, axis), (share, net, size) = found.where, found.most
-    distance = round(found.total / STATES, DIGITS)
+    distance = round(found.total / distances.STATES, DIGITS)
     return described.SurgeonDifference(
         one=names[0],
         other=names[1],
@@ -326,7 +307,7 @@ def _apart(compared: _Compared, one: int, other: int, of_one: int, of_other: int
     )
 
 
-def _sentence(found: Difference, names: tuple[str, str], scaled: bool) -> str:
+def _sentence(found: distances.Difference, names: tuple[str, str], scaled: bool) -> str:
     """Return the sentence on the part of the path and the axis with the largest difference."""
     (part, axis), (share, net, size) = found.where, found.most
     there = f"{share:.0%} of their difference is there, {axis}."

@@ -27,17 +27,7 @@ from skills.formats.jigsaws import Trial
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy, did_you_mean
 from skills.schemas.calibrations import Calibration, CalibrationSettings, RatedTrials, TaskCounts
-from skills.scoring.calibration import (
-    LEAST_RATING,
-    LEVELS,
-    MOST_RATING,
-    STRENGTHS,
-    Cohort,
-    SkillModel,
-    as_numbers,
-    calibrate,
-    from_numbers,
-)
+from skills.scoring import calibration
 from skills.scoring.features import TRIAL_NAMES as FIGURES
 from skills.scoring.features import TrialFigures, measure_trial
 from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, refusals, validate
@@ -51,7 +41,7 @@ VERSION = 1  # of what is stored; a calibration of another version is not used
 class Rated:
     """A cohort, its source, and the names of trials that were left out, by the reason."""
 
-    cohort: Cohort
+    cohort: calibration.Cohort
     data: RatedTrials
     left_out: dict[str, list[str]]
 
@@ -72,41 +62,41 @@ def read_cohort(folder: Path, *, tasks: Sequence[str] = (), progress: Callable[[
         BadRecording: A file cannot be read as a recording; the message names it.
     """
     trials = _of_tasks(folder, tasks)
-    ratings = _ratings(trials)
-    empty = [trial for trial in trials if trial.kinematics.stat().st_size == 0]
-    rated = [trial for trial in trials if trial.name in ratings and trial not in empty]
-    measured: dict[str, TrialFigures | None] = {}
-    for number, trial in enumerate(rated):
-        measured[trial.name] = _measured(trial)
-        progress((number + 1) / len(rated))
-    used = [trial for trial in rated if measured[trial.name] is not None]
+    for task in sorted({trial.task for trial in trials}):
+        _check_ratings([trial for trial in trials if trial.task == task])
+    rated = [(trial, trial.rated) for trial in trials if trial.rated is not None]
+    empty = [trial.name for trial, _ in rated if trial.kinematics.stat().st_size == 0]
+    moving = [one for one in rated if one[0].name not in empty]
+    measured = []
+    for number, (trial, rating) in enumerate(moving, 1):
+        measured.append((trial, rating, _measured(trial)))
+        progress(number / len(moving))
+    used = [(trial, rating, figures) for trial, rating, figures in measured if figures is not None]
     if not used:
-        raise BadInput(f"None of {len(rated)} trials can be measured: a trial has both instruments and some seconds.")
-    found = [figures for trial in used if (figures := measured[trial.name]) is not None]
-    users, names = sorted({trial.user for trial in used}), sorted({trial.task for trial in used})
-    of_each = [ratings[trial.name] for trial in used]
-    cohort = Cohort(
+        raise BadInput(f"None of {len(moving)} trials can be measured: a trial has both instruments and some seconds.")
+    users, names = sorted({trial.user for trial, *_ in used}), sorted({trial.task for trial, *_ in used})
+    cohort = calibration.Cohort(
         names=tuple(names),
-        values=np.stack([one.values for one in found]),
-        thirds=np.stack([one.thirds for one in found]),
-        tasks=np.array([names.index(trial.task) for trial in used]),
-        surgeons=np.array([users.index(trial.user) for trial in used]),
-        repetitions=np.array([trial.number for trial in used]),
-        ratings=np.array([(one.score, *one.parts) for one in of_each], np.float64),
-        levels=np.array([LEVELS.index(one.skill) for one in of_each]),
+        values=np.stack([figures.values for *_, figures in used]),
+        thirds=np.stack([figures.thirds for *_, figures in used]),
+        tasks=np.array([names.index(trial.task) for trial, *_ in used]),
+        surgeons=np.array([users.index(trial.user) for trial, *_ in used]),
+        repetitions=np.array([trial.number for trial, *_ in used]),
+        ratings=np.array([(rating.score, *rating.parts) for _, rating, _ in used], np.float64),
+        levels=np.array([calibration.LEVELS.index(rating.skill) for _, rating, _ in used]),
     )
     data = RatedTrials(
-        tasks={name: _counts([trial for trial in used if trial.task == name], ratings) for name in names},
+        tasks={name: _counts([(trial, rating) for trial, rating, _ in used if trial.task == name]) for name in names},
         left_out=len(trials) - len(used),
         surgeons=len(users),
         trials=len(used),
-        files=sorted(map(_digest, _files(trials))),
+        files=sorted(map(_digest, {trial.kinematics for trial in trials} | {trial.meta for trial in trials})),
     )
     left_out = {
         "rated, but without a kinematics file": _without_file(trials),
-        "unrated": [trial.name for trial in trials if trial.name not in ratings],
-        "empty": [trial.name for trial in empty if trial.name in ratings],
-        "too short to be measured": [name for name, figures in measured.items() if figures is None],
+        "unrated": [trial.name for trial in trials if trial.rated is None],
+        "empty": empty,
+        "too short to be measured": [trial.name for trial, _, figures in measured if figures is None],
     }
     return Rated(cohort, data, {why: names for why, names in left_out.items() if names})
 
@@ -118,11 +108,11 @@ def calibrate_on(
     found, judged = validate(rated.cohort, seed=seed, permutations=permutations, progress=progress)
     return Calibration(
         version=VERSION,
-        model=as_numbers(calibrate(rated.cohort, found)),
+        model=calibration.as_numbers(calibration.calibrate(rated.cohort, found)),
         data=rated.data,
         validated=judged,
         settings=CalibrationSettings(
-            strengths=list(STRENGTHS), seed=seed, permutations=permutations, bootstraps=BOOTSTRAPS
+            strengths=list(calibration.STRENGTHS), seed=seed, permutations=permutations, bootstraps=BOOTSTRAPS
         ),
         versions={"suture-skills": __version__} | {name: version(name) for name in LIBRARIES},
     )
@@ -168,7 +158,7 @@ def newest(session: Session) -> StoredCalibration | None:
     return session.scalar(select(StoredCalibration).order_by(StoredCalibration.row.desc()).limit(1))
 
 
-def read_calibration(stored: StoredCalibration) -> SkillModel | None:
+def read_calibration(stored: StoredCalibration) -> calibration.SkillModel | None:
     """Return the model of a calibration; None for one of another version, which is not used.
 
     Raises:
@@ -179,7 +169,7 @@ def read_calibration(stored: StoredCalibration) -> SkillModel | None:
     if stored.about.version != VERSION:
         return None
     try:
-        model = from_numbers(stored.about.model)
+        model = calibration.from_numbers(stored.about.model)
         return model if model.figures == FIGURES else None
     except (BadInput, KeyError, TypeError) as error:
         raise Corrupt("The numbers of the stored calibration are no model.", Remedy(Action.CALIBRATE)) from error
@@ -205,19 +195,12 @@ def _of_tasks(folder: Path, tasks: Sequence[str]) -> list[Trial]:
     return found
 
 
-def _ratings(trials: Sequence[Trial]) -> dict[str, jigsaws.RatedTrial]:
-    """Return the rating of each trial that has one, by the trial's name.
+def _check_ratings(trials: Sequence[Trial]) -> None:
+    """Refuse the trials of a task whose ratings cannot be used.
 
     Raises:
-        BadInput: A task's file of ratings is missing, has none of these trials, or has one that cannot be read.
+        BadInput: The file of ratings is missing, has none of these trials, or has one that cannot be read.
     """
-    rated: dict[str, jigsaws.RatedTrial] = {}
-    for task in sorted({trial.task for trial in trials}):
-        rated |= _ratings_of_task([trial for trial in trials if trial.task == task])
-    return rated
-
-
-def _ratings_of_task(trials: Sequence[Trial]) -> dict[str, jigsaws.RatedTrial]:
     meta = trials[0].meta
     if not meta.is_file():
         raise BadInput(
@@ -235,31 +218,23 @@ def _ratings_of_task(trials: Sequence[Trial]) -> dict[str, jigsaws.RatedTrial]:
             unrated=len(unread),
         )
     for name, one in rated.items():
-        if not LEAST_RATING <= one.score <= MOST_RATING:
-            limits = f"{LEAST_RATING:g} to {MOST_RATING:g}"
+        if not calibration.LEAST_RATING <= one.score <= calibration.MOST_RATING:
+            limits = f"{calibration.LEAST_RATING:g} to {calibration.MOST_RATING:g}"
             raise BadInput(f"{meta} rates {name} with {one.score}; the global rating score is {limits}.")
-    return rated
 
 
-def _counts(used: Sequence[Trial], ratings: dict[str, jigsaws.RatedTrial]) -> TaskCounts:
+def _counts(used: Sequence[tuple[Trial, jigsaws.RatedTrial]]) -> TaskCounts:
     """Return the numbers of trials, surgeons and levels of a task."""
-    levels = Counter(ratings[trial.name].skill for trial in used)
-    return TaskCounts(
-        trials=len(used), surgeons=len({trial.user for trial in used}), levels=dict(sorted(levels.items()))
-    )
+    levels = Counter(rating.skill for _, rating in used)
+    users = {trial.user for trial, _ in used}
+    return TaskCounts(trials=len(used), surgeons=len(users), levels=dict(sorted(levels.items())))
 
 
 def _without_file(trials: Sequence[Trial]) -> list[str]:
     """Return the names of the trials that have a rating and no file."""
-    listed: set[str] = set()
-    for meta in {trial.meta for trial in trials}:
-        listed |= jigsaws.read_meta(meta.read_text(errors="replace")).keys()
+    texts = [meta.read_text(errors="replace") for meta in {trial.meta for trial in trials}]
+    listed = {name for text in texts for name in jigsaws.read_meta(text)}
     return sorted(listed - {trial.name for trial in trials})
-
-
-def _files(trials: Sequence[Trial]) -> set[Path]:
-    """Return the paths of all files that a cohort was read from."""
-    return {trial.kinematics for trial in trials} | {trial.meta for trial in trials}
 
 
 def _measured(trial: Trial) -> TrialFigures | None:

@@ -9,7 +9,7 @@ measuring, so that an interruption loses little work. Both kinds of distances ar
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 
 import numpy as np
@@ -30,6 +30,7 @@ from skills.library.operation import locks
 
 DEMOS_AT_ONCE = 100  # recorded motions in memory; each has some thousand samples
 PAIRS_AT_ONCE = 20_000  # measured between two transactions: about a second
+MEASURED = "The distances between demonstrations are being measured; request them again in a moment."
 PATIENCE_S = 30.0  # timeout of the wait for another thread's measuring; 1000 demonstrations take about as long
 
 _measuring = Lock()  # two requests at once would measure the same pairs twice
@@ -69,7 +70,7 @@ def far_apart(database: Database, rows: Sequence[int]) -> Distances:
     apart = _laid_out(known)
     if len(known) == len(wanted) and not np.isnan(apart.apart_mm).any():
         return apart
-    with _one_at_a_time():
+    with one_at_a_time(_measuring, MEASURED):
         complete = apart.rows[~np.isnan(apart.apart_mm).any(axis=1)]
         known |= stored_shapes(database, sorted({*wanted} - {*complete.tolist()}))  # measured by another thread
         new = shapes_of(database, [row for row in wanted if row not in known])
@@ -82,23 +83,28 @@ def far_apart(database: Database, rows: Sequence[int]) -> Distances:
 
 
 @contextmanager
-def _one_at_a_time() -> Iterator[None]:
-    if not _measuring.acquire(timeout=PATIENCE_S):
-        raise Busy("The distances between demonstrations are being measured; request them again in a moment.")
+def one_at_a_time(lock: Lock, busy: str) -> Iterator[None]:
+    """Hold a lock.
+
+    Raises:
+        Busy: Another thread has held it for more than `PATIENCE_S`; the message is `busy`.
+    """
+    if not lock.acquire(timeout=PATIENCE_S):
+        raise Busy(busy)
     try:
         yield
     finally:
-        _measuring.release()
+        lock.release()
 
 
 def shapes_of(database: Database, rows: Sequence[int]) -> ByRow:
     """Compute the shapes of recorded demonstrations, `DEMOS_AT_ONCE` at a time."""
     made: ByRow = {}
-    for at in range(0, len(rows), DEMOS_AT_ONCE):
-        some = Demonstration.row.in_(rows[at : at + DEMOS_AT_ONCE])
+    of, nothing = Demonstration, (np.empty(0, np.int64), np.empty(0), np.empty(0))
+    for some in in_parts(rows, DEMOS_AT_ONCE):
         with database.reading() as session:
-            recorded = session.execute(select(Demonstration.row, Demonstration.demo).where(some)).all()
-        made |= {row: Measured(shape_or_none(demo), *_NOTHING, signature_of(demo)) for row, demo in recorded}
+            recorded = session.execute(select(of.row, of.demo).where(of.row.in_(some))).all()
+        made |= {row: Measured(shape_or_none(demo), *nothing, signature_of(demo)) for row, demo in recorded}
     return made
 
 
@@ -108,9 +114,6 @@ def shape_or_none(demo: Demo) -> Floats | None:
         return shape_of(demo)
     except BadPath:
         return None
-
-
-_NOTHING = np.empty(0, np.int64), np.empty(0), np.empty(0)
 
 
 def _measure(known: Mapping[int, Measured]) -> Iterator[ByRow]:
@@ -125,12 +128,11 @@ def _measure(known: Mapping[int, Measured]) -> Iterator[ByRow]:
         for (one, others), (mm, lengths) in zip(block, parts, strict=True):
             row = int(apart.rows[one])
             before = known[row]
-            grown[row] = Measured(
-                before.shape_mm,
-                np.append(before.others, apart.rows[others]),
-                np.append(before.apart_mm, mm),
-                np.append(before.apart_scaled, lengths),
-                before.signature,
+            grown[row] = replace(
+                before,
+                others=np.append(before.others, apart.rows[others]),
+                apart_mm=np.append(before.apart_mm, mm),
+                apart_scaled=np.append(before.apart_scaled, lengths),
             )
         yield grown
 
@@ -162,8 +164,8 @@ def _blocks(missing: NDArray[np.bool_]) -> Iterator[list[tuple[int, Ints]]]:
 
 def _laid_out(known: Mapping[int, Measured]) -> Distances:
     """Return the known distances as full matrices."""
-    shapes = {row: known[row].shape_mm for row in sorted(known)}
-    rows = np.array([row for row, shape in shapes.items() if shape is not None], np.int64)
+    shapes = {row: shape for row in sorted(known) if (shape := known[row].shape_mm) is not None}
+    rows = np.array(list(shapes), np.int64)
     apart_mm, apart_scaled = (np.full((len(rows), len(rows)), np.nan) for _ in range(2))
     for at, row in enumerate(rows.tolist()):
         one = known[row]
@@ -172,9 +174,8 @@ def _laid_out(known: Mapping[int, Measured]) -> Distances:
         for matrix, totals in ((apart_mm, one.apart_mm), (apart_scaled, one.apart_scaled)):
             matrix[at, at] = 0.0
             matrix[at, places[there]] = matrix[places[there], at] = totals[there]
-    whole = np.array([shape for shape in shapes.values() if shape is not None])
-    signatures = np.array([known[row].signature for row in rows.tolist()]).reshape(-1, NUMBERS)
-    return Distances(rows, whole, apart_mm, apart_scaled, signatures)
+    signatures = np.array([known[row].signature for row in shapes]).reshape(-1, NUMBERS)
+    return Distances(rows, np.array(list(shapes.values())), apart_mm, apart_scaled, signatures)
 
 
 def is_current() -> ColumnElement[bool]:

@@ -11,7 +11,7 @@ One process holds at most `skills.comparison.nearest.MOST` shapes; the suture ty
 room. What a key may not see stays in the index, and is not searched for it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from threading import Lock
 from typing import Any
@@ -29,15 +29,14 @@ from skills.db import in_parts
 from skills.db.models import Demonstration, Surgeon
 from skills.db.row_visibility import ALL_ROWS, ONLY
 from skills.db.session import Database
-from skills.errors import BadPath, Busy, Conflict
+from skills.errors import BadPath, Conflict
 from skills.library.comparison.atlas import DISTANCE, NO_DIRECTION, UNITS
-from skills.library.comparison.measuring import shapes_of, store_shapes, stored_shapes
+from skills.library.comparison.measuring import one_at_a_time, shapes_of, store_shapes, stored_shapes
 from skills.library.comparison.members import Member, comparable_demo, members_among, without_overlaps
 from skills.library.people.consent import may
 from skills.schemas.comparison import Nearest, Neighbour
 
 ROWS_AT_ONCE = 500  # shapes read from the database
-PATIENCE_S = 30.0  # timeout of the wait for another thread that fills the index
 DIGITS = 4
 CALLERS = 8  # keys with different rows whose rows are remembered
 MORE = 8  # neighbours beyond the requested ones, for those that turn out to be cuts of one motion
@@ -75,17 +74,15 @@ def nearest_to(database: Database, demo: str, count: int, *, scaled: bool = Fals
         NotFound: There is no such demonstration.
         Conflict: It was withdrawn, or consent does not cover it; or there are more than an index holds.
         BadPath: It has no direction.
-        Busy: Another thread has been filling the index for more than `PATIENCE_S`.
+        Busy: Another thread has been filling the index for more than `measuring.PATIENCE_S`.
     """
-    if not _using.acquire(timeout=PATIENCE_S):
-        raise Busy("The shapes of the demonstrations are being read; request it again in a moment.")
-    try:
+    with one_at_a_time(_using, "The shapes of the demonstrations are being read; request it again in a moment."):
         with database.reading() as session:
             asked = comparable_demo(session, demo)
-            unrestricted = _listed(session, asked.suture, unrestricted=True)
-            visible = _listed(session, asked.suture) if ONLY in session.info else unrestricted
+            every_row = _listed(session, asked.suture, ALL_ROWS)
+            visible = _listed(session, asked.suture, {}) if ONLY in session.info else every_row
             held = _touch(database, asked.suture)
-            _remove(session, held, unrestricted)
+            _remove(session, held, every_row)
             rows = held.visible[visible] if visible in held.visible else visible.rows(session)
         if visible not in held.visible:
             _add_missing(database, asked.suture, held, rows)
@@ -94,20 +91,16 @@ def nearest_to(database: Database, demo: str, count: int, *, scaled: bool = Fals
             held.visible[visible] = rows
         if asked.row not in held.index:
             raise BadPath(f"{NO_DIRECTION} Cut the hand-off from its start to the point where the needle is taken.")
-        among = None if visible == unrestricted else np.isin(held.index.rows, rows, kind="table")
+        among = None if visible == every_row else np.isin(held.index.rows, rows, kind="table")
         shape = held.index.shape_of(asked.row)
-        wanted = count
+        shape, wanted = in_lengths(shape) if scaled else shape, count + MORE
         while True:
-            found = held.index.nearest(
-                in_lengths(shape) if scaled else shape, wanted + MORE, scaled=scaled, among=among
-            )
+            found = held.index.nearest(shape, wanted, scaled=scaled, among=among)
             neighbours = _counted(database, asked, *found)
-            if len(neighbours) >= count or len(found[0]) < wanted + MORE:
+            if len(neighbours) >= count or len(found[0]) < wanted:
                 break
-            wanted *= 2
+            wanted = 2 * (wanted - MORE) + MORE
         searched = (len(held.index) if among is None else int(among.sum())) - 1
-    finally:
-        _using.release()
     return Nearest(
         demo=asked.sha256,
         suture=asked.suture,
@@ -126,7 +119,7 @@ def forget_gone(database: Database) -> None:
     try:
         for suture, held in _indices.get(database.engine, {}).items():
             with database.reading() as session:
-                _remove(session, held, _listed(session, suture, unrestricted=True))
+                _remove(session, held, _listed(session, suture, ALL_ROWS))
     finally:
         _using.release()
 
@@ -145,37 +138,38 @@ class _Listed:
     count: int
     total: int
     last: int
+    options: Mapping[str, bool] = field(compare=False)  # of the queries: with or without the rows that are hidden
 
-    def rows(self, session: Session, *, unrestricted: bool = False) -> Ints:
+    def rows(self, session: Session) -> Ints:
         """Return the rows, increasing, shape (N,)."""
         rows = func.aggregate_strings(cast(Demonstration.row, Text), ",")  # one text: of many rows the fastest way
-        texts = _of_each(session, [rows], self.suture, self.surgeons, unrestricted=unrestricted)
+        texts = _of_each(session, [rows], self.suture, self.surgeons, self.options)
         numbers = [np.array(text.split(","), np.int64) for (text,) in texts if text]
         return np.setdiff1d(np.concatenate(numbers) if numbers else np.empty(0, np.int64), np.array(self.withdrawn))
 
 
-def _listed(session: Session, suture: str, *, unrestricted: bool = False) -> _Listed:
-    options = ALL_ROWS if unrestricted else {}
+def _listed(session: Session, suture: str, options: Mapping[str, bool]) -> _Listed:
     of = Demonstration.row
     surgeons = [one.row for one in session.scalars(select(Surgeon), execution_options=options) if may(one, "atlas")]
     figures = [func.count(), func.coalesce(func.sum(of), 0), func.coalesce(func.max(of), 0)]
-    found = _of_each(session, figures, suture, surgeons, unrestricted=unrestricted)
+    found = _of_each(session, figures, suture, surgeons, options)
     counts, totals, lasts = zip(*found, strict=True) if found else ((), (), ())
     withdrawn = select(of).where(Demonstration.withdrawn_at.is_not(None))
     gone = tuple(sorted(session.scalars(withdrawn, execution_options=options)))
-    return _Listed(suture, tuple(surgeons), gone, sum(counts), int(sum(totals)), max(lasts, default=0))
+    return _Listed(suture, tuple(surgeons), gone, sum(counts), int(sum(totals)), max(lasts, default=0), options)
 
 
 def _of_each(
-    session: Session, columns: Sequence[ColumnElement[Any]], suture: str, surgeons: Sequence[int], *, unrestricted: bool
+    session: Session,
+    columns: Sequence[ColumnElement[Any]],
+    suture: str,
+    surgeons: Sequence[int],
+    options: Mapping[str, bool],
 ) -> list[Row[Any]]:
     """Aggregate the rows of surgeons' demonstrations; an index alone has them, where a row has the whole motion."""
     query = select(*columns).where(Demonstration.suture == suture)
-    options = ALL_ROWS if unrestricted else {}
-    return [
-        session.execute(query.where(Demonstration.surgeon_row.in_(some)), execution_options=options).one()
-        for some in in_parts(surgeons)
-    ]
+    some = (query.where(Demonstration.surgeon_row.in_(part)) for part in in_parts(surgeons))
+    return [session.execute(one, execution_options=options).one() for one in some]
 
 
 def _touch(database: Database, suture: str) -> _SutureIndex:
@@ -185,33 +179,34 @@ def _touch(database: Database, suture: str) -> _SutureIndex:
     return indices[suture]
 
 
-def _remove(session: Session, held: _SutureIndex, unrestricted: _Listed) -> None:
+def _remove(session: Session, held: _SutureIndex, every_row: _Listed) -> None:
     """Remove the rows that may not be compared any more."""
-    if unrestricted == held.listed:
+    if every_row == held.listed:
         return
-    gone = np.setdiff1d(held.known(), unrestricted.rows(session, unrestricted=True)).tolist()
+    gone = np.setdiff1d(held.known(), every_row.rows(session)).tolist()
     held.index.remove(gone)
     held.without -= {*gone}
-    held.listed = unrestricted
+    held.listed = every_row
     held.visible.clear()
 
 
 def _add_missing(database: Database, suture: str, held: _SutureIndex, visible: Ints) -> None:
     """Add the rows that a caller may see and that the index does not have."""
     indices, missing = _indices[database.engine], np.setdiff1d(visible, held.known()).tolist()
-    if len(held.index) + len(missing) > places.MOST:
+    demos = len(held.index) + len(missing)
+    if demos > places.MOST:
         raise Conflict(
-            f"There are {len(held.index) + len(missing)} demonstrations of '{suture}', and an index holds "
-            f"{places.MOST}; withdraw those that are not used for learning.",
-            demos=len(held.index) + len(missing),
+            f"There are {demos} demonstrations of '{suture}', and an index holds {places.MOST}; withdraw those that "
+            "are not used for learning.",
+            demos=demos,
         )
     while sum(len(one.index) for one in indices.values()) + len(missing) > places.MOST:
         del indices[next(one for one in indices if one != suture)]
-    for at in range(0, len(missing), ROWS_AT_ONCE):
-        _add(database, held, missing[at : at + ROWS_AT_ONCE])
+    for some in in_parts(missing, ROWS_AT_ONCE):
+        _add(database, held, some)
 
 
-def _add(database: Database, held: _SutureIndex, rows: list[int]) -> None:
+def _add(database: Database, held: _SutureIndex, rows: Sequence[int]) -> None:
     known = stored_shapes(database, rows)
     new = shapes_of(database, [row for row in rows if row not in known])
     store_shapes(database, new)
@@ -235,13 +230,7 @@ def _counted(database: Database, asked: Demonstration, rows: Ints, totals: Float
         one = there.get(row)
         if one is None or row == asked.row or (own is not None and one.same_motion(own)):
             continue
-        neighbours.append(
-            Neighbour(
-                demo=one.sha256,
-                surgeon=one.surgeon,
-                session=one.session,
-                arm=one.arm,
-                distance=round(total / STATES, DIGITS),
-            )
-        )
+        apart = round(total / STATES, DIGITS)
+        found = Neighbour(demo=one.sha256, surgeon=one.surgeon, session=one.session, arm=one.arm, distance=apart)
+        neighbours.append(found)
     return neighbours

@@ -61,6 +61,11 @@ class Recognised:
     arms: dict[str, _Arm]
     because: tuple[str, ...]
 
+    @property
+    def slugs(self) -> list[str]:
+        """The surgeons of all arms."""
+        return sorted({slug for arm in self.arms.values() for slug in arm.slugs})
+
 
 def recognise_arms(members: Sequence[Member], signatures: Floats) -> Recognised:
     """Validate the recognition of the surgeons of each arm's demonstrations.
@@ -119,23 +124,21 @@ def votes(found: Recognised) -> Votes | None:
     """Return how many recordings' votes name their surgeon; None if there is no recognition."""
     if not found.arms:
         return None
-    by_recording: dict[int, str] = {}
-    for arm in found.arms.values():
-        for one in arm.validated.tested.tolist():
-            by_recording[arm.members[one].recording_row] = arm.members[one].surgeon
+    tested = [arm.members[one] for arm in found.arms.values() for one in arm.validated.tested.tolist()]
+    by_recording = {one.recording_row: one.surgeon for one in tested}
     right = sum(_voted(found, row)[0] == surgeon for row, surgeon in by_recording.items())
     return Votes(
         recordings=len(by_recording),
         right=right,
         accuracy=right / len(by_recording),
         interval=wilson(right, len(by_recording)),
-        chance=1.0 / len({slug for arm in found.arms.values() for slug in arm.slugs}),
+        chance=1.0 / len(found.slugs),
     )
 
 
 def _voted(found: Recognised, recording_row: int) -> tuple[str | None, int]:
     """Return the surgeon for whom a recording's tested demonstrations vote, and their number."""
-    slugs = sorted({slug for arm in found.arms.values() for slug in arm.slugs})
+    slugs = found.slugs
     ballots = []
     for arm in found.arms.values():
         for probability in arm.voters(recording_row):
@@ -189,12 +192,12 @@ def recognise_recording(database: Database, recording_sha256: str, suture: str, 
         BadInput: There are not two surgeons with two sessions each, or no movement of the recording could be tested.
     """
     chosen = _known(database, recording_sha256, suture)
-    moved = {row: _movements(database, one, parse) for row, one in chosen.items()}
+    moved = {sha256: _movements(database, sha256, one, parse) for sha256, one in chosen.items()}
     still = _known(database, recording_sha256, suture)  # consent may have ended while they were read
-    pairs = [pair for row, some in moved.items() if row in still for pair in some]
+    pairs = [pair for sha256, some in moved.items() if sha256 in still for pair in some]
     found = recognise_arms([member for member, _ in pairs], np.array([signature for _, signature in pairs]))
-    asked = next(one for one in still.values() if one.recording == recording_sha256)
-    named, voters = _voted(found, asked.member.recording_row)
+    asked = still[recording_sha256]
+    named, voters = _voted(found, asked.recording_row)
     counted = votes(found)
     if named is None or counted is None:
         raise BadInput(
@@ -204,7 +207,7 @@ def recognise_recording(database: Database, recording_sha256: str, suture: str, 
     return RecognisedRecording(
         recording=recording_sha256,
         suture=suture,
-        surgeon=asked.member.surgeon,
+        surgeon=asked.surgeon,
         voted=named,
         voters=voters,
         votes=counted,
@@ -214,16 +217,8 @@ def recognise_recording(database: Database, recording_sha256: str, suture: str, 
     )
 
 
-@dataclass(frozen=True)
-class _Known:
-    """A recording of a known surgeon: its digest, and one of its demonstrations."""
-
-    recording: str
-    member: Member
-
-
-def _known(database: Database, recording_sha256: str, suture: str) -> dict[int, _Known]:
-    """Return recordings with demonstrations of one surgeon, who agreed, by row: the requested and the newest others."""
+def _known(database: Database, recording_sha256: str, suture: str) -> dict[str, Member]:
+    """Return a demonstration of each recording of one surgeon, who agreed, by digest: the requested and newest ones."""
     with database.reading() as session:
         asked = find_recording(session, recording_sha256)
         members, _ = members_of(session, find_suture_type(session, suture).slug)
@@ -237,13 +232,13 @@ def _known(database: Database, recording_sha256: str, suture: str) -> dict[int, 
         if asked.row not in single:
             raise Conflict("Several surgeons are in this recording, so it has no single one.")
         digests = select(StoredRecording.row, StoredRecording.sha256).where(StoredRecording.row.in_(single))
-        return {row: _Known(sha256, by_row[row]) for row, sha256 in session.execute(digests).all()}
+        return {sha256: by_row[row] for row, sha256 in session.execute(digests).all()}
 
 
-def _movements(database: Database, known: _Known, parse: Parser) -> list[tuple[Member, Floats]]:
+def _movements(database: Database, sha256: str, known: Member, parse: Parser) -> list[tuple[Member, Floats]]:
     """Return the movements of a recording as members of its surgeon, with their signatures."""
     try:
-        recording = stored_recording(database, known.recording, parse).recording
+        recording = stored_recording(database, sha256, parse).recording
     except BadRecording:  # this version does not read it; the others are compared
         return []
     found = []
@@ -253,6 +248,6 @@ def _movements(database: Database, known: _Known, parse: Parser) -> list[tuple[M
             shape_of(demo)
         except (BadRecording, BadPath):  # too short, or without a direction
             continue
-        member = replace(known.member, arm=demo.arm, frame=demo.frame, start_s=demo.start_s, end_s=demo.end_s)
+        member = replace(known, arm=demo.arm, frame=demo.frame, start_s=demo.start_s, end_s=demo.end_s)
         found.append((member, signature_of(demo)))
     return found

@@ -21,6 +21,7 @@ from sqlalchemy.orm import Session
 
 from skills.arrays import Floats
 from skills.comparison.distances import distances, shape_of
+from skills.db import newest
 from skills.db.models import Demonstration, MeasuredShape, StoredRecording, Surgeon
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
@@ -36,16 +37,7 @@ from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
 from skills.library.recordings.demos import find_demo, newest_demo
 from skills.library.recordings.recordings import Parser, find_recording, stored_recording
-from skills.schemas.scores import (
-    CurvePoint,
-    Percentiles,
-    Progress,
-    Reference,
-    Score,
-    ScoredStyle,
-    ScoreIn,
-    SessionFigures,
-)
+from skills.schemas import scores as described
 from skills.scoring.calibration import LEVELS, Level
 from skills.scoring.deviation import as_recorded, differences, laid, laid_on
 from skills.scoring.features import KINDS, Numbers, compare, measure, measure_trial
@@ -85,14 +77,10 @@ def others_of(
         compared: The demonstrations that are compared with each other.
         surgeon: The only surgeon whose demonstrations are measured; None: all.
     """
-    query = (
-        select(Demonstration)
-        .where(Demonstration.suture == suture, Demonstration.withdrawn_at.is_(None))
-        .order_by(Demonstration.row.desc())
-        .limit(MOST_OTHERS)
-    )
+    of = Demonstration
+    query = newest(of, of.suture == suture, of.withdrawn_at.is_(None), limit=MOST_OTHERS)
     if surgeon is not None:
-        query = query.where(Demonstration.surgeon_row == surgeon.row)
+        query = query.where(of.surgeon_row == surgeon.row)
     first = {one.row for one in compared}
     found = sorted(session.scalars(query), key=lambda one: (one.row in first, not one.failed, one.row))
     members, _ = without_overlaps([member_of(row) for row in found if may(row.surgeon, "atlas")])
@@ -111,8 +99,8 @@ def others_of(
 
 def _shapes(session: Session, rows: Sequence[int]) -> dict[int, Floats]:
     """Return the shapes of demonstrations, by row: those stored for the atlas, and newly measured ones for the rest."""
-    of_these = MeasuredShape.demonstration_row.in_(rows)
-    stored = session.scalars(select(MeasuredShape).where(of_these, is_current()))
+    of = MeasuredShape
+    stored = session.scalars(select(of).where(of.demonstration_row.in_(rows), is_current()))
     shapes = {one.demonstration_row: one.measured.shape_mm for one in stored}
     recorded = select(Demonstration.row, Demonstration.demo).where(Demonstration.row.in_({*rows} - {*shapes}))
     shapes |= {row: shape_or_none(demo) for row, demo in session.execute(recorded)}
@@ -121,7 +109,7 @@ def _shapes(session: Session, rows: Sequence[int]) -> dict[int, Floats]:
 
 def percentiles(
     others: Sequence[Other], mine: Numbers, scored: Demonstration | None, reference: Demonstration
-) -> list[Percentiles]:
+) -> list[described.Percentiles]:
     """Return the percentiles of a motion's figures among the demonstrations of each skill level.
 
     The scored one and the reference are left out, and all that are marked recovery or failure: a level is represented
@@ -134,7 +122,7 @@ def percentiles(
     ]
 
 
-def _percentile(level: Level, some: Sequence[Other], mine: Numbers) -> Percentiles:
+def _percentile(level: Level, some: Sequence[Other], mine: Numbers) -> described.Percentiles:
     """Return the share of a level's demonstrations with a smaller value, for each figure; equal values count half."""
     reason, below = None, None
     surgeons = {one.row.surgeon_row for one in some}
@@ -142,7 +130,7 @@ def _percentile(level: Level, some: Sequence[Other], mine: Numbers) -> Percentil
         reason = f"at least {LEAST_DEMOS} demonstrations of {LEAST_SURGEONS} surgeons are needed"
     else:
         below = {name: _share_below(mine[name], [one.numbers[name] for one in some]) for name in mine}
-    return Percentiles(level=level, demos=len(some), surgeons=len(surgeons), reason=reason, below=below)
+    return described.Percentiles(level=level, demos=len(some), surgeons=len(surgeons), reason=reason, below=below)
 
 
 def _share_below(value: float | None, among: Sequence[float | None]) -> float | None:
@@ -153,21 +141,17 @@ def _share_below(value: float | None, among: Sequence[float | None]) -> float | 
     return sum(0.5 if math.isclose(one, value) else float(one < value) for one in known) / len(known)
 
 
-def course(others: Sequence[Other], scored: Demonstration | None) -> list[CurvePoint]:
-    """List the scored surgeon's demonstrations of the suture type up to the scored one, in the order of recording."""
-    return _in_order(_up_to(others, scored))
-
-
 def _up_to(others: Sequence[Other], scored: Demonstration | None) -> list[Other]:
-    """Return the demonstrations of the scored one's surgeon up to it; none without it."""
+    """Return the demonstrations of the scored one's surgeon up to it in the order of recording; none without it."""
     if scored is None:
         return []
     return [one for one in others if one.row.surgeon_row == scored.surgeon_row and _when(one.row) <= _when(scored)]
 
 
-def _in_order(mine: Sequence[Other]) -> list[CurvePoint]:
+def _curve(mine: Sequence[Other]) -> list[described.CurvePoint]:
+    """List one surgeon's demonstrations in the order of recording."""
     return [
-        CurvePoint(
+        described.CurvePoint(
             demo=one.row.sha256,
             session=one.row.session,
             stored_at=one.row.recording.created_at,
@@ -183,7 +167,7 @@ def _when(row: Demonstration) -> tuple[int, float]:
     return row.recording_row, row.start_s
 
 
-def by_session(others: Sequence[Other]) -> list[SessionFigures]:
+def by_session(others: Sequence[Other]) -> list[described.SessionFigures]:
     """Return the medians of one surgeon's demonstrations by sessions, in the order of recording.
 
     As in an atlas, cuts of one recording are of one session, and a recording without a session name is one.
@@ -193,7 +177,7 @@ def by_session(others: Sequence[Other]) -> list[SessionFigures]:
     firsts = np.unique(of, return_index=True)[1].tolist()
     sessions = [[one for one, number in zip(mine, of, strict=True) if number == of[first]] for first in sorted(firsts)]
     return [
-        SessionFigures(
+        described.SessionFigures(
             session=some[0].row.session,
             stored_at=some[0].row.recording.created_at,
             demos=len(some),
@@ -210,7 +194,7 @@ def _median(some: Sequence[Other], name: str) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def progress(database: Database, surgeon: str, suture: str, against: str) -> Progress:
+def progress(database: Database, surgeon: str, suture: str, against: str) -> described.Progress:
     """Return how a surgeon's demonstrations compare with another's reference, session by session.
 
     Args:
@@ -231,12 +215,14 @@ def progress(database: Database, surgeon: str, suture: str, against: str) -> Pro
         reference, because = _reference(session, against, suture)
         require(reference.surgeon, "atlas")
         others = list(others_of(session, suture, shape_of(reference.demo), [reference], mine))
-        return Progress(
+        return described.Progress(
             surgeon=mine.slug,
-            style=ScoredStyle(surgeon=against, suture=suture),
-            reference=Reference(demo=reference.sha256, because=because, is_itself=mine.row == reference.surgeon_row),
+            style=described.ScoredStyle(surgeon=against, suture=suture),
+            reference=described.Reference(
+                demo=reference.sha256, because=because, is_itself=mine.row == reference.surgeon_row
+            ),
             sessions=by_session(others),
-            demos=_in_order(others),
+            demos=_curve(others),
             use=CREDENTIAL,
         )
 
@@ -253,7 +239,7 @@ class _Scored:
     row: Demonstration | None = None
 
 
-def score(database: Database, asked: ScoreIn, parse: Parser) -> Score:
+def score(database: Database, asked: described.ScoreIn, parse: Parser) -> described.Score:
     """Score a motion against a style.
 
     Args:
@@ -290,23 +276,26 @@ def score(database: Database, asked: ScoreIn, parse: Parser) -> Score:
             skill = unrated(NOT_AGREED)
     mine = {**numbers, "distance_mm": deviation.distance_mm}
     row = scored.row
-    return Score(
+    own = _up_to(others, row)
+    return described.Score(
         demo=row.sha256 if row else None,
         recording=scored.recording.sha256,
         arm=scored.demo.arm,
         start_s=scored.demo.start_s,
         end_s=scored.demo.end_s,
         surgeon=row.surgeon.slug if row else None,
-        style=ScoredStyle(surgeon=asked.surgeon, suture=asked.suture),
-        reference=Reference(demo=reference.sha256, because=because, is_itself=bool(row and row.row == reference.row)),
+        style=described.ScoredStyle(surgeon=asked.surgeon, suture=asked.suture),
+        reference=described.Reference(
+            demo=reference.sha256, because=because, is_itself=bool(row and row.row == reference.row)
+        ),
         figures=compare(numbers, beside),
         deviation=deviation,
         differences=named,
         as_recorded=as_recorded(scored.demo, taught),
         tie_break=TIE_BREAK,
         percentiles=percentiles(others, mine, row, reference),
-        curve=course(others, row),
-        sessions=by_session(_up_to(others, row)),
+        curve=_curve(own),
+        sessions=by_session(own),
         skill=skill,
         use=CREDENTIAL,
     )
@@ -345,24 +334,24 @@ def _reference(session: Session, slug: str, suture: str, digest: str | None = No
         more = len(policy.manifest.demos) - 1
         rest = f" and {more} more" if more else ""
         return policy.demonstration, f"the released policy, version {policy.version}, was learnt from it{rest}"
-    newest = newest_demo(session, surgeon.row, suture)
-    if newest is None:
+    last = newest_demo(session, surgeon.row, suture)
+    if last is None:
         raise NotFound(f"There is no demonstration of '{slug}' and '{suture}' to compare with.")
-    return newest, "no policy is released, and it is the newest demonstration"
+    return last, "no policy is released, and it is the newest demonstration"
 
 
 def _of_expert(session: Session, reference: Demonstration, scored: Demonstration | None) -> list[Demo]:
     """Return the motions of the reference's surgeon, the reference first, without the scored motion and its cuts."""
     of = Demonstration
     same = of.surgeon_row == reference.surgeon_row, of.suture == reference.suture, of.arm == reference.arm
-    query = select(of).where(*same, of.learnable)
-    newest = [one for one in session.scalars(query.order_by(of.row.desc()).limit(MOST_OF_EXPERT)) if one != reference]
-    members = [member_of(one) for one in (*newest[::-1], reference, *([scored] if scored else []))]
+    query = newest(of, *same, limit=MOST_OF_EXPERT).where(of.learnable)
+    others = [one for one in session.scalars(query) if one != reference]
+    members = [member_of(one) for one in (*others[::-1], reference, *([scored] if scored else []))]
     counted = {one.row for one in without_overlaps(members)[0]} - {scored.row if scored else None}
-    return [one.demo for one in (reference, *newest) if one.row in counted]
+    return [one.demo for one in (reference, *others) if one.row in counted]
 
 
-def _stored(session: Session, asked: ScoreIn) -> _Scored | None:
+def _stored(session: Session, asked: described.ScoreIn) -> _Scored | None:
     """Return the stored demonstration to be scored; None if a part of a recording is to be scored."""
     if asked.demo is None:
         return None
@@ -372,7 +361,7 @@ def _stored(session: Session, asked: ScoreIn) -> _Scored | None:
     return _Scored(row.demo, row.recording, row)
 
 
-def _of_recording(database: Database, asked: ScoreIn, parse: Parser) -> _Scored:
+def _of_recording(database: Database, asked: described.ScoreIn, parse: Parser) -> _Scored:
     """Cut the motion to be scored out of a stored recording, without storing it."""
     assert asked.recording is not None
     with database.reading() as session:

@@ -6,7 +6,7 @@ A backup cannot contain later changes. The list contains all of them, so that a 
 removes data and permissions, never adds them.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -50,8 +50,7 @@ LISTED = (
     ("change", "surgeon"),
     ("train", "policy-version"),
 )
-T = TypeVar("T")
-M = TypeVar("M", datetime, int)
+V = TypeVar("V")
 # By the list names in `ENDS`: digests or ids, and the moment at which each last ended.
 Ended = Mapping[str, Mapping[str, datetime]]
 
@@ -88,11 +87,11 @@ class Erasures:
         """Return the union of two lists; for an entry in both the later moment counts."""
         kinds = [kind for kind in ENDS.values() if kind in self.ended or kind in other.ended]
         return Erasures(
-            {**other.surgeons, **self.surgeons},
-            {kind: _latest(self.ended.get(kind, {}), other.ended.get(kind, {})) for kind in kinds},
-            {**other.consents, **_later(self.consents, other.consents)},
-            {**other.outcomes, **_later(self.outcomes, other.outcomes)},
-            _latest(self.numbers, other.numbers),
+            _merged(self.surgeons, other.surgeons),
+            {kind: _merged(self.ended.get(kind, {}), other.ended.get(kind, {})) for kind in kinds},
+            _merged(self.consents, other.consents),
+            _merged(self.outcomes, other.outcomes),
+            _merged(self.numbers, other.numbers),
         )
 
     def since(self, known: "Erasures") -> "Erasures":
@@ -100,29 +99,27 @@ class Erasures:
 
         It knows an entry that ended there at the same moment or later, and a consent or an outcome that is as recent.
         """
-        ended = {
-            kind: {name: at for name, at in names.items() if not _knows(known.ended.get(kind, {}), name, at)}
-            for kind, names in self.ended.items()
-        }
-        consents, outcomes = _later(self.consents, known.consents), _later(self.outcomes, known.outcomes)
-        numbers = {style: last for style, last in self.numbers.items() if not _knows(known.numbers, style, last)}
-        surgeons = {digest: erased for digest, erased in self.surgeons.items() if digest not in known.surgeons}
-        return Erasures(surgeons, ended, consents, outcomes, numbers)
+        return Erasures(
+            _newer(self.surgeons, known.surgeons),
+            {kind: _newer(names, known.ended.get(kind, {})) for kind, names in self.ended.items()},
+            _newer(self.consents, known.consents),
+            _newer(self.outcomes, known.outcomes),
+            _newer(self.numbers, known.numbers),
+        )
 
 
-def _latest(one: Mapping[Any, M], other: Mapping[Any, M]) -> dict[Any, M]:
-    return {**other, **{name: at for name, at in one.items() if not _knows(other, name, at)}}
+def _newer(one: Mapping[str, V], other: Mapping[str, V]) -> dict[str, V]:
+    """Return the entries of one list that the other lacks, or has with an earlier moment or a smaller number."""
+    return {name: said for name, said in one.items() if name not in other or _order(other[name]) < _order(said)}
 
 
-def _knows(known: Mapping[Any, M], name: Any, at: M) -> bool:
-    return name in known and known[name] >= at
+def _merged(one: Mapping[str, V], other: Mapping[str, V]) -> dict[str, V]:
+    return {**other, **_newer(one, other)}
 
 
-def _later(
-    one: Mapping[str, tuple[datetime, T]], other: Mapping[str, tuple[datetime, T]]
-) -> dict[str, tuple[datetime, T]]:
-    """Return the statements of one list that are later than the other's on the same object, or the only ones."""
-    return {name: said for name, said in one.items() if name not in other or other[name][0] < said[0]}
+def _order(said: Any) -> Any:
+    """Return what an entry is compared by: its moment, its number, or the salt, which is always the same."""
+    return said[0] if isinstance(said, tuple) else said
 
 
 NOTHING = Erasures()
@@ -261,37 +258,36 @@ def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
         session.add(Erasure(salt=salt, digest=digest, erased_at=erased_at))
     for slug in sorted(surgeons):
         erase_surgeon(session, slug, "restore")
-    demos = _here(later, "demonstrations", session, select(Demonstration.sha256))
-    for demo in demos:
-        erase_demo(session, demo, "restore")
+
+    def end(kind: str, in_force: Select[str], again: Callable[[str], object]) -> int:
+        names = {*later.ended.get(kind, ())}.intersection(session.scalars(in_force))
+        for name in sorted(names):
+            again(name)
+        return len(names)
+
+    erased = end("demonstrations", select(Demonstration.sha256), lambda demo: erase_demo(session, demo, "restore"))
     # A recording with demonstrations was uploaded again after its deletion, in a history that the list does not cover.
-    uncut = ~exists().where(Demonstration.recording_row == StoredRecording.row)
-    deleted = _here(later, "recordings", session, select(StoredRecording.sha256).where(uncut))
-    for recording in deleted:
-        delete_recording(session, recording, "restore", as_admin=True)
+    uncut = select(StoredRecording.sha256).where(~exists().where(Demonstration.recording_row == StoredRecording.row))
+    deleted = end("recordings", uncut, lambda name: delete_recording(session, name, "restore", as_admin=True))
     active = select(Demonstration.sha256).where(Demonstration.withdrawn_at.is_(None))
-    withdrawn = _here(later, "withdrawn", session, active)
-    for demo in withdrawn:
-        withdraw_demo(session, demo, "restore")
+    withdrawn = end("withdrawn", active, lambda demo: withdraw_demo(session, demo, "restore"))
     marked = _mark_again(session, later.outcomes)
     withdraw_policies(session, later.ended.get("releases", {}), "restore")
-    keys = _here(later, "keys", session, select(Key.id).where(Key.revoked_at.is_(None)))
-    for key in keys:
-        revoke_key(session, key, "restore")
+    valid = select(Key.id).where(Key.revoked_at.is_(None))
+    revoked = end("keys", valid, lambda key: revoke_key(session, key, "restore"))
     narrowed = _narrow(session, later.consents)
     rows = {one.subject: one.row for one in session.scalars(select(Surgeon))}
     for style, last in later.numbers.items():
         subject, _, suture = style.partition("/")
         if subject in rows:
             session.add(LastUsed(surgeon_row=rows[subject], suture=suture, last=last))
-    stopped = len(served - _served(session))
     return {
         "surgeons_erased": len(surgeons),
-        "demos_erased": len(demos),
-        "recordings_deleted": len(deleted),
-        "demos_withdrawn": len(withdrawn),
-        "styles_stopped": stopped,
-        "keys_revoked": len(keys),
+        "demos_erased": erased,
+        "recordings_deleted": deleted,
+        "demos_withdrawn": withdrawn,
+        "styles_stopped": len(served - _served(session)),
+        "keys_revoked": revoked,
         "consents_narrowed": narrowed,
         "demos_marked": marked,
     }
@@ -304,11 +300,6 @@ def _mark_again(session: Session, outcomes: Mapping[str, tuple[datetime, DemoOut
     for demo in here:
         mark_demo(session, demo, failed[demo], "Marked after the backup that was restored.", "restore")
     return len(here)
-
-
-def _here(later: Erasures, kind: str, session: Session, names: Select[str]) -> list[str]:
-    """Return the names in one part of a list that are still in force in this database."""
-    return sorted({*later.ended.get(kind, ())}.intersection(session.scalars(names)))
 
 
 def _served(session: Session) -> set[tuple[int, str]]:

@@ -18,7 +18,7 @@ from math import inf
 from time import monotonic
 from typing import Any
 
-from sqlalchemy import Connection, exists, select, text
+from sqlalchemy import Connection, exists, select, text, tuple_
 
 from skills.db import in_parts
 from skills.db.change_notes import REMOVE
@@ -30,16 +30,7 @@ from skills.db.session import Database
 from skills.db.tiles import TILES, fill_tiles, full_tiles, stored_tiles
 from skills.errors import BadSettings, Corrupt, NotReady, SkillsError
 from skills.remedies import Action, Remedy
-from skills.transparency.merkle import (
-    TILE_WIDTH,
-    Checkpoint,
-    Tree,
-    inclusion_proof,
-    leaf_hash,
-    node_from,
-    proven_root,
-    root_of,
-)
+from skills.transparency import merkle
 from skills.transparency.notes import Note, read_notes
 
 SIGNING_LOCK = 0x5C112  # ours: the number of the advisory lock under which one process at a time signs
@@ -172,15 +163,15 @@ def _is_signed(connection: Connection, leaf: Latest) -> bool:
     return True
 
 
-def covered_leaf(connection: Connection, leaf: Latest, signed: Checkpoint) -> list[bytes]:
+def covered_leaf(connection: Connection, leaf: Latest, signed: merkle.Checkpoint) -> list[bytes]:
     """Return the hashes that prove a leaf under a checkpoint (RFC 6962).
 
     Raises:
         Corrupt: They do not lead to its root.
     """
     if leaf.number is not None and leaf.number < signed.size:
-        hashes = inclusion_proof(signed.size, leaf.number, node_from(stored_tiles(connection)))
-        if proven_root(leaf_hash(leaf.entry.encode()), leaf.number, signed.size, hashes) == signed.root:
+        hashes = merkle.inclusion_proof(signed.size, leaf.number, merkle.node_from(stored_tiles(connection)))
+        if merkle.proven_root(merkle.leaf_hash(leaf.entry.encode()), leaf.number, signed.size, hashes) == signed.root:
             return hashes
     raise Corrupt("The history is not as it was signed, so it proves nothing.", Remedy(Action.VERIFY))
 
@@ -190,18 +181,12 @@ def covered_leaf(connection: Connection, leaf: Latest, signed: Checkpoint) -> li
 
 @dataclass
 class Verified:
-    """The numbers of leaves and rows that a verification has compared."""
+    """The leaves as a verification has read them, and the numbers of leaves and rows that it has compared."""
 
     leaves: int = 0
     rows: int = 0
-
-
-@dataclass
-class _Log:
-    """The leaves as they were read: the newest of each row that exists, and the hashes in the order of the tree."""
-
     live: dict[bytes, tuple[str, str | None, int]] = field(default_factory=dict)  # by hash: table, key, row of the leaf
-    hashes: dict[int, bytes] = field(default_factory=dict)
+    hashes: dict[int, bytes] = field(default_factory=dict)  # by the number in the tree
     seen: set[bytes] = field(default_factory=set)  # the hashes of all leaves
 
 
@@ -214,7 +199,7 @@ def verify_history(
         connection: In a transaction that reads one state.
         history: The history, with its key.
         heads: Checkpoints that were kept elsewhere; the history must continue each of them. None: those of its file.
-        done: Counts what was compared.
+        done: Empty; it counts what was compared.
 
     Yields:
         Findings: what is wrong, and why.
@@ -251,19 +236,19 @@ def verify_history(
             signed.append((name, note))
             if note not in here and any(one is not None and one.checkpoint.size > note.checkpoint.size for one in here):
                 yield name, "its checkpoint was removed from the database, which has later ones"
-    read = _Log()
-    for leaf in _leaves(connection):
+    leaves = select(LEAVES).order_by(LEAVES.c.row).execution_options(yield_per=ROWS_AT_ONCE)
+    for leaf in connection.execute(leaves):
         name = f"{leaf.table_name} {leaf.key or '(erased)'}"
-        for why in _wrong_with(leaf, read):
+        for why in _wrong_with(leaf, done):
             yield name, why
         under_other_key = leaf.number is not None and since is not None and leaf.number < since
         if not under_other_key and not hmac.compare_digest(leaf.seal, seal.of(leaf.entry.encode())):
             yield name, f"its leaf {leaf.row} of the history was not written by the service: the seal is wrong"
         done.leaves += 1
-    yield from _wrong_roots(read.hashes, signed)
+    yield from _wrong_roots(done.hashes, signed)
     size = max((note.checkpoint.size for _, note in signed), default=0)
-    yield from islice(_wrong_tiles(connection, read.hashes, size), NAMED)
-    yield from _wrong_rows(connection, read, done)
+    yield from islice(_wrong_tiles(connection, done.hashes, size), NAMED)
+    yield from _wrong_rows(connection, done)
 
 
 def _checkpoints(connection: Connection) -> Iterator[tuple[int, int, Note | None]]:
@@ -271,24 +256,15 @@ def _checkpoints(connection: Connection) -> Iterator[tuple[int, int, Note | None
     for row, size, said, subtrees in connection.execute(query.order_by(CHECKPOINTS.c.row)):
         try:
             (note,) = read_notes(said)
-            tree = Tree(size, [subtrees[at : at + 32] for at in range(0, len(subtrees), 32)])
+            tree = merkle.Tree(size, [subtrees[at : at + 32] for at in range(0, len(subtrees), 32)])
         except (SkillsError, ValueError, AssertionError):
             note = None
         yield row, size, note if note is not None and tree.root == note.checkpoint.root else None
 
 
-def _leaves(connection: Connection) -> Iterator[Any]:
-    after = 0
-    while page := connection.execute(
-        select(LEAVES).where(LEAVES.c.row > after).order_by(LEAVES.c.row).limit(ROWS_AT_ONCE)
-    ).all():
-        yield from page
-        after = page[-1].row
-
-
-def _wrong_with(leaf: Any, read: _Log) -> Iterator[str]:
+def _wrong_with(leaf: Any, read: Verified) -> Iterator[str]:
     """Add a leaf to those read, and yield the faults of its content and of its place among the row's leaves."""
-    digest = leaf_hash(leaf.entry.encode())
+    digest = merkle.leaf_hash(leaf.entry.encode())
     if leaf.number is not None:
         read.hashes[leaf.number] = digest
     if digest in read.seen:  # such as of a row that was erased, and put back together with its old leaf
@@ -313,19 +289,15 @@ def _wrong_with(leaf: Any, read: _Log) -> Iterator[str]:
 
 def _wrong_roots(hashes: dict[int, bytes], signed: Sequence[tuple[str, Note]]) -> Iterator[Finding]:
     """Yield the signed heads that the tree does not continue, and the numbers that are missing in it."""
-    tree = Tree()
-    sized: dict[int, list[tuple[str, Note]]] = {}
-    for name, note in signed:
-        sized.setdefault(note.checkpoint.size, []).append((name, note))
-    for size in sorted(sized):
+    tree, size = merkle.Tree(), 0
+    for name, note in sorted(signed, key=lambda one: one[1].checkpoint.size):
+        size = note.checkpoint.size
         while tree.size < size and tree.size in hashes:
             tree.append(hashes[tree.size])
-        for name, note in sized[size]:
-            if tree.size < size:
-                yield name, f"it was signed over {size} leaves, and leaf {tree.size} is missing: the history was cut"
-            elif tree.root != note.checkpoint.root:
-                yield name, "the leaves are not those that were signed"
-    size = max(sized, default=0)
+        if tree.size < size:
+            yield name, f"it was signed over {size} leaves, and leaf {tree.size} is missing: the history was cut"
+        elif tree.root != note.checkpoint.root:
+            yield name, "the leaves are not those that were signed"
     beyond = [number for number in hashes if number >= size]
     for number in beyond[:NAMED]:
         yield f"leaf {number}", "it has a number, and no signed checkpoint covers it"
@@ -338,13 +310,15 @@ def _wrong_tiles(connection: Connection, hashes: dict[int, bytes], size: int) ->
     for level, full in full_tiles(size):
         roots: list[bytes | None] = []
         for number in range(full):
-            of_tile = [one for one in below[number * TILE_WIDTH : (number + 1) * TILE_WIDTH] if one is not None]
-            if len(of_tile) < TILE_WIDTH:  # leaves are missing, which is named elsewhere
+            of_tile = [
+                one for one in below[number * merkle.TILE_WIDTH : (number + 1) * merkle.TILE_WIDTH] if one is not None
+            ]
+            if len(of_tile) < merkle.TILE_WIDTH:  # leaves are missing, which is named elsewhere
                 roots.append(None)
                 continue
             this = (TILES.c.level == level, TILES.c.number == number)
             stored = connection.execute(select(TILES.c.root, TILES.c.hashes).where(*this)).first()
-            roots.append(root_of(of_tile))
+            roots.append(merkle.root_of(of_tile))
             if stored is None:
                 yield f"history_tiles {level}/{number}", "it is missing"
             elif tuple(stored) != (roots[-1], b"".join(of_tile)):
@@ -355,10 +329,10 @@ def _wrong_tiles(connection: Connection, hashes: dict[int, bytes], size: int) ->
         yield f"history_tiles {level}/{number}", "no signed checkpoint covers its leaves"
 
 
-def _wrong_rows(connection: Connection, read: _Log, done: Verified) -> Iterator[Finding]:
+def _wrong_rows(connection: Connection, done: Verified) -> Iterator[Finding]:
     """Yield the rows that differ from their newest leaf, rows without a leaf, and leaves without their row."""
     newest: dict[str, dict[str, int]] = {}
-    for table, key, row in read.live.values():
+    for table, key, row in done.live.values():
         of_table = newest.setdefault(table, {})
         if key is None:
             yield f"{table} (erased)", f"its leaf {row} has lost its content, and no leaf says that the row was removed"
@@ -366,34 +340,29 @@ def _wrong_rows(connection: Connection, read: _Log, done: Verified) -> Iterator[
             yield f"{table} {key}", f"its leaf {row} is another first leaf"
         else:
             of_table[key] = row
-    for name, known in logged().items():
+    schema: list[_Read] = [(key, (sql,)) for key, sql in schema_of(connection).items()]
+    tables = [(name, known.columns, _pages(connection, known)) for name, known in logged().items()]
+    for name, columns, pages in (*tables, (SCHEMA, ("sql",), iter([schema]))):
         left = newest.pop(name, {})
-        for page in _pages(connection, known):
-            yield from _wrong_page(connection, name, known.columns, page, left)
+        for page in pages:
+            yield from _wrong_page(connection, name, columns, page, left)
             done.rows += len(page)
         yield from _missing(name, left)
-    left = newest.pop(SCHEMA, {})
-    schema: list[_Read] = [(key, (sql,)) for key, sql in schema_of(connection).items()]
-    yield from _wrong_page(connection, SCHEMA, ("sql",), schema, left)
-    yield from _missing(SCHEMA, left)
     for other, rows in newest.items():
         yield from _missing(other, rows)
 
 
 def _pages(connection: Connection, table: Logged) -> Iterator[list[_Read]]:
     """Yield all rows some at a time: the key, and the logged columns or the error of reading them."""
-    after: Sequence[Any] | None = None
-    while True:
-        query = select(*table.key_columns).order_by(*table.key_columns).limit(ROWS_AT_ONCE)
-        page = connection.execute(query if after is None else query.where(table.after(after))).all()
-        if not page:
-            return
+    query = select(*table.key_columns).order_by(*table.key_columns).limit(ROWS_AT_ONCE)
+    page = connection.execute(query).all()
+    while page:
         keys = [table.key_of(row) for row in page]
         try:
             yield [(table.key_of(row), row) for row in table.rows_of(connection, keys)]
         except Exception:  # one of them cannot be read; reading each alone finds which
             yield [_alone(connection, table, key) for key in keys]
-        after = page[-1]
+        page = connection.execute(query.where(tuple_(*table.key_columns) > tuple_(*page[-1]))).all()
 
 
 def _alone(connection: Connection, table: Logged, key: str) -> _Read:

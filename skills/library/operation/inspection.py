@@ -21,23 +21,7 @@ from typing import Any
 from sqlalchemy import Column, ColumnElement, ForeignKey, Table, case, exists, func, select, text, tuple_
 from sqlalchemy.orm import Mapper, Session, defer, object_session
 
-from skills.db import Base
-from skills.db.models import (
-    Demonstration,
-    LooseChunks,
-    ParsedChunk,
-    ParsedRecording,
-    Plan,
-    PolicyVersion,
-    RecordingChunk,
-    Release,
-    StoredCalibration,
-    StoredPlayback,
-    StoredPoses,
-    StoredRecording,
-    StoredRewardMap,
-    Surgeon,
-)
+from skills.db import Base, models
 from skills.db.packed import Packed, digest
 from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import DatasetChunk, ErasedSurgeon, Job, StoredDataset
@@ -48,7 +32,7 @@ from skills.formats.reader_process import READER_VERSION
 from skills.gridworld.reward import sparse_reward
 from skills.library.comparison.calibrations import read_calibration
 from skills.library.operation.history import Verified, verify_history
-from skills.library.operation.integrity import covered, demo_identity, planned, posed
+from skills.library.operation.integrity import OF_DEMO, covered, demo_identity, planned, posed
 from skills.library.operation.jobs import identity_of
 from skills.library.policies.combined import learnt_from
 from skills.library.policies.pose_styles import poses_of_demonstrations
@@ -59,9 +43,11 @@ from skills.settings import Settings
 from skills.transparency.notes import Note
 
 ROWS_AT_ONCE = 100
-WITH_OTHERS = {RecordingChunk, ParsedChunk, DatasetChunk}  # checked with the row that they belong to
+WITH_OTHERS = {models.RecordingChunk, models.ParsedChunk, DatasetChunk}  # checked with the row that they belong to
 HISTORY = "history signed"
 NAMED = 20  # orphans that are named for one reference, of all that are counted
+
+OTHER_DIGEST = "it does not match its digest"
 
 Why = Iterator[str]
 
@@ -169,8 +155,8 @@ def _references(session: Session, checked: Checked) -> None:
                 checked.wrong.append((_name(table, row), why))
     # Without a foreign key, because they are deleted after the row to which they belong.
     for column, owner, late in (
-        (RecordingChunk.recording, StoredRecording, LooseChunks.recording_row),
-        (Job.surgeon_row, Surgeon, ErasedSurgeon.surgeon_row),
+        (models.RecordingChunk.recording, models.StoredRecording, models.LooseChunks.recording_row),
+        (Job.surgeon_row, models.Surgeon, ErasedSurgeon.surgeon_row),
     ):
         table = Base.metadata.tables[column.class_.__tablename__]
         left = (column.is_not(None), ~exists().where(owner.row == column), ~exists().where(late == column))
@@ -259,6 +245,7 @@ def _wrong_with(row: Any, packed: Sequence[str]) -> Why:
             yield f"{name}: {_describe(error)}"
             return
     try:
+        VERIFIED.get(type(row), lambda _: None)(row)
         yield from AGREES.get(type(row), lambda _: iter(()))(row)
     except Exception as error:
         yield _describe(error)
@@ -280,8 +267,8 @@ def _decoded_again(database: Database, tell: Parser, every: bool) -> Iterator[Ch
     """Compare cached contents with their recordings decoded again: of the newest recording, or of every one."""
     checked = Checked("recordings decoded")
     yield checked
-    query = select(ParsedRecording.recording_row).where(ParsedRecording.version == READER_VERSION)
-    query = query.order_by(ParsedRecording.recording_row.desc())
+    query = select(models.ParsedRecording.recording_row).where(models.ParsedRecording.version == READER_VERSION)
+    query = query.order_by(models.ParsedRecording.recording_row.desc())
     rows: Sequence[int] = ()
     with checked.noting(checked.what), database.reading() as session:
         rows = session.scalars(query if every else query.limit(1)).all()
@@ -296,7 +283,7 @@ def _decoded_again(database: Database, tell: Parser, every: bool) -> Iterator[Ch
 def _decoded_otherwise(database: Database, row: int, tell: Parser) -> Why:
     """Yield the fault of a cached content: it differs from the recording's bytes. Damaged ones are found before."""
     with database.reading() as session:
-        stored = session.get(StoredRecording, row)
+        stored = session.get(models.StoredRecording, row)
         kept = None if stored is None else cached_content(session, stored)
     if kept is None:  # erased or replaced since, or damaged
         return
@@ -335,13 +322,13 @@ def _again(
     yield checked
     rows: list[int] = []
     with checked.noting(checked.what), database.reading() as session:
-        every = session.scalars(select(PolicyVersion.row).order_by(PolicyVersion.row))
+        every = session.scalars(select(models.PolicyVersion.row).order_by(models.PolicyVersion.row))
         rows = [row for row in every if row not in done]
     if limit is not None and limit < len(rows):
         rows = sorted(secrets.SystemRandom().sample(rows, limit))
     checked.of = len(rows)
     for row in rows:
-        name = f"{PolicyVersion.__tablename__} {row}"
+        name = f"{models.PolicyVersion.__tablename__} {row}"
         with checked.noting(name), suppress(Corrupt, NotFound):  # reported with the row; erased since
             found = compare(row)
             if found.left_out is None:
@@ -364,72 +351,67 @@ def _session_of(row: Any) -> Session:
     return session
 
 
-def _recording(row: StoredRecording) -> Why:
-    session = _session_of(row)
-    size = sum(len(piece) for piece in recording_bytes(session, row))  # raises `Corrupt` if the digest differs
+def _recording(row: models.StoredRecording) -> Why:
+    size = sum(len(piece) for piece in recording_bytes(_session_of(row), row))  # raises `Corrupt` if the digest differs
     if size != row.size_bytes:
         yield f"it has {size} bytes, its row has {row.size_bytes}"
 
 
-def _parsed_recording(row: ParsedRecording) -> Why:
+def _entry(row: models.ParsedRecording) -> None:
     session = _session_of(row)
     if row.version == READER_VERSION:  # others are not used
-        read_entry(session, session.get_one(StoredRecording, row.recording_row))  # raises `Corrupt`
-    yield from ()
+        read_entry(session, session.get_one(models.StoredRecording, row.recording_row))
 
 
 def _dataset(row: StoredDataset) -> Why:
-    session = _session_of(row)
     seen, size = hashlib.sha256(), 0
     query = select(DatasetChunk.data).where(DatasetChunk.dataset_row == row.row).order_by(DatasetChunk.number)
-    for data in session.scalars(query.execution_options(yield_per=1)):
+    for data in _session_of(row).scalars(query.execution_options(yield_per=1)):
         seen.update(data)
         size += len(data)
     if seen.hexdigest() != row.sha256:
-        yield "it does not match its digest"
+        yield OTHER_DIGEST
     if size != row.size_bytes:
         yield f"it has {size} bytes, its row has {row.size_bytes}"
 
 
-def _demonstration(row: Demonstration) -> Why:
+def _demonstration(row: models.Demonstration) -> Why:
     if demo_identity(row.recording.sha256, row.surgeon.slug, row.suture, row.demo, row.path) != row.sha256:
-        yield "it does not match its digest"
+        yield OTHER_DIGEST
     if row.hysteresis != row.path.hysteresis:
         yield "its hysteresis differs from that of its path"
-    for name in ("arm", "topic", "frame", "instrument", "start_s", "end_s"):
+    for name in OF_DEMO:
         if getattr(row, name) != getattr(row.demo, name):
             yield f"its {name} differs from the recording"
 
 
-def _reward_map(row: StoredRewardMap) -> Why:
-    session = _session_of(row)
+def _reward_map(row: models.StoredRewardMap) -> Why:
     if digest(row.map) != row.sha256:
-        yield "it does not match its digest"
-    path = session.get_one(Demonstration, row.demonstration_row).path
+        yield OTHER_DIGEST
+    path = _session_of(row).get_one(models.Demonstration, row.demonstration_row).path
     if digest(sparse_reward(path, row.map.levels)) != row.sha256:
         yield "it differs from the result of Algorithm 1 for its demonstration"
 
 
-def _policy(row: PolicyVersion) -> Why:
+def _policy(row: models.PolicyVersion) -> Why:
     manifest, demonstrations = row.manifest, row.demonstrations
-    if manifest.identity(digest(row.learnt)) != row.sha256:
-        yield "it differs from the certified policy"
-    covered(row)
-    if row.releasable != (not manifest.grid_certificate.refused_because):
-        yield "its flag `releasable` contradicts its certificate"
-    if manifest.style != (row.surgeon.slug, row.suture):
-        yield "its manifest names another style"
-    if manifest.surroundings != row.learnt.surroundings:
-        yield "its manifest states another scene than it was learnt in"
-    if manifest.demos != [one.sha256 for one in demonstrations]:
-        yield "it was learnt from another demonstration"
-    if any((one.surgeon_row, one.suture) != (row.surgeon_row, row.suture) for one in demonstrations):
-        yield "its demonstration is of another style"
+    refused = manifest.grid_certificate.refused_because
+    styles = {(one.surgeon_row, one.suture) for one in demonstrations}
+    faults = {
+        "it differs from the certified policy": manifest.identity(digest(row.learnt)) != row.sha256,
+        "its flag `releasable` contradicts its certificate": row.releasable == bool(refused),
+        "its manifest names another style": manifest.style != (row.surgeon.slug, row.suture),
+        "its manifest states another scene than it was learnt in": manifest.surroundings != row.learnt.surroundings,
+        "it was learnt from another demonstration": manifest.demos != [one.sha256 for one in demonstrations],
+        "its demonstration is of another style": styles != {(row.surgeon_row, row.suture)},
+    }
+    yield from (why for why, has_it in faults.items() if has_it)
     if digest(row.learnt.path) != digest(learnt_from(row).path):
         yield "its path differs from that of its demonstration"
+    covered(row)  # raises `Corrupt`
 
 
-def _poses(row: StoredPoses) -> Why:
+def _poses(row: models.StoredPoses) -> Why:
     poses = posed(row)
     own = replace(poses.path, partner=None)  # the other arm's motion is in recordings alone: `relearning.learn_again`
     again = poses_of_demonstrations(row.policy)
@@ -437,7 +419,7 @@ def _poses(row: StoredPoses) -> Why:
         yield "it differs from the poses of its version's demonstrations"
 
 
-def _release(row: Release) -> Why:
+def _release(row: models.Release) -> Why:
     policy = row.policy
     if (policy.surgeon_row, policy.suture) != (row.surgeon_row, row.suture):
         yield "it releases a policy of another style"
@@ -447,12 +429,7 @@ def _release(row: Release) -> Why:
         yield from (f"it is not withdrawn, but its demonstration {one.text}" for one in policy.objections)
 
 
-def _plan(row: Plan) -> Why:
-    planned(row)
-    yield from ()
-
-
-def _playback(row: StoredPlayback) -> Why:
+def _playback(row: models.StoredPlayback) -> Why:
     if (row.report.plan, row.report.identity) != (row.plan.sha256, row.sha256):
         yield "it does not match the digest of plan and verdict"
     if row.feasible != row.report.feasible:
@@ -461,27 +438,25 @@ def _playback(row: StoredPlayback) -> Why:
         yield "its motion is not the one that was judged"
 
 
-def _calibration(row: StoredCalibration) -> Why:
-    read_calibration(row)
-    yield from ()
-
-
 def _job(row: Job) -> Why:
     if identity_of(row.kind, row.request) != row.identity:
         yield "its request does not match its identity"
 
 
+# By the class of a row: what raises an error where the row does not match its digest, and what yields its faults.
+VERIFIED: dict[type, Callable[[Any], object]] = {
+    models.ParsedRecording: _entry,
+    models.Plan: planned,
+    models.StoredCalibration: read_calibration,
+}
 AGREES: dict[type, Callable[[Any], Why]] = {
-    StoredRecording: _recording,
-    ParsedRecording: _parsed_recording,
+    models.StoredRecording: _recording,
     StoredDataset: _dataset,
-    Demonstration: _demonstration,
-    StoredRewardMap: _reward_map,
-    PolicyVersion: _policy,
-    StoredPoses: _poses,
-    Release: _release,
-    Plan: _plan,
-    StoredPlayback: _playback,
-    StoredCalibration: _calibration,
+    models.Demonstration: _demonstration,
+    models.StoredRewardMap: _reward_map,
+    models.PolicyVersion: _policy,
+    models.StoredPoses: _poses,
+    models.Release: _release,
+    models.StoredPlayback: _playback,
     Job: _job,
 }

@@ -10,14 +10,14 @@ nothing is substituted for it.
 
 from collections.abc import Iterable
 from dataclasses import asdict
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredPoses, StoredRecording
+from skills.db import Identified
+from skills.db.models import Plan, PolicyVersion, StoredPoses
 from skills.db.packed import digest
-from skills.db.service_tables import StoredDataset
 from skills.db.weighted_cache import WeightedCache
 from skills.demonstration.demonstration import Demo
 from skills.errors import AmbiguousDigest, Corrupt, NotFound
@@ -31,9 +31,11 @@ from skills.planning.plan import SuturePlan
 from skills.remedies import Remedy
 from skills.schemas.policies import PolicyManifest
 
-Row = TypeVar("Row", Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording, StoredDataset)
+Row = TypeVar("Row", bound=Identified)
 
 WHOLE = 64
+# The columns of a demonstration that repeat attributes of its motion.
+OF_DEMO = ("arm", "topic", "frame", "instrument", "start_s", "end_s")
 SHOWN = 5
 
 
@@ -151,7 +153,7 @@ def demo_identity(recording_sha256: str, surgeon: str, suture: str, demo: Demo, 
     return sha256(canonical(what_identifies(recording_sha256, surgeon, suture, demo, path)))
 
 
-def what_identifies(recording_sha256: str, surgeon: str, suture: str, demo: Demo, path: GridPath) -> dict[str, Any]:
+def what_identifies(recording_sha256: str, surgeon: str, suture: str, demo: Demo, path: GridPath) -> dict[str, object]:
     """Return the JSON of which a demonstration's digest is computed."""
     return {
         "recording": recording_sha256,

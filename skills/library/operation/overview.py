@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from skills.db import newest
 from skills.db.models import (
     Demonstration,
     Plan,
@@ -37,10 +38,7 @@ def newest_recordings(
     session: Session, before: int | None = None, limit: int = MOST
 ) -> list[tuple[StoredRecording, int]]:
     """List recordings, the newest first, each with the number of its active demonstrations."""
-    query = select(StoredRecording).order_by(StoredRecording.row.desc()).limit(limit)
-    if before is not None:
-        query = query.where(StoredRecording.row < before)
-    found = session.scalars(query).all()
+    found = session.scalars(newest(StoredRecording, limit=limit, before=before)).all()
     of = Demonstration
     active = (of.withdrawn_at.is_(None), of.recording_row.in_([one.row for one in found]))
     cut = select(of.recording_row, func.count().label("demos")).where(*active).group_by(of.recording_row)
@@ -58,16 +56,10 @@ def newest_plans(
     session: Session, before: int | None = None, limit: int = MOST
 ) -> list[tuple[Plan, StoredPlayback | None]]:
     """List plans, the newest first, each with its newest playback."""
-    query = select(Plan).order_by(Plan.row.desc()).limit(limit)
-    if before is not None:
-        query = query.where(Plan.row < before)
-    found = session.scalars(query).all()
-    last = select(func.max(StoredPlayback.row)).where(StoredPlayback.plan_row.in_([one.row for one in found]))
-    played = session.scalars(
-        select(StoredPlayback).where(StoredPlayback.row.in_(last.group_by(StoredPlayback.plan_row)))
-    )
-    newest = {one.plan_row: one for one in played}
-    return [(one, newest.get(one.row)) for one in found]
+    found, played = session.scalars(newest(Plan, limit=limit, before=before)).all(), StoredPlayback
+    last = select(func.max(played.row)).where(played.plan_row.in_([one.row for one in found])).group_by(played.plan_row)
+    of_plan = {one.plan_row: one for one in session.scalars(select(played).where(played.row.in_(last)))}
+    return [(one, of_plan.get(one.row)) for one in found]
 
 
 @dataclass(frozen=True)
@@ -82,16 +74,13 @@ class Played:
 def playbacks_of(session: Session, plan: Plan) -> list[Played]:
     """List a plan's playbacks, the newest first."""
     query = select(StoredPlayback).where(StoredPlayback.plan_row == plan.row).order_by(StoredPlayback.row.desc())
-    return [_played(session, one) for one in session.scalars(query)]
-
-
-def _played(session: Session, playback: StoredPlayback) -> Played:
-    drawn = session.scalar(select(StoredPictures.row).where(StoredPictures.playback_row == playback.row))
-    job = None if drawn else job_of_pictures(session, playback)
-    return Played(playback, drawn is not None, job)
+    listed = []
+    for one in session.scalars(query).all():
+        drawn = session.scalar(select(StoredPictures.row).where(StoredPictures.playback_row == one.row)) is not None
+        listed.append(Played(one, drawn, None if drawn else job_of_pictures(session, one)))
+    return listed
 
 
 def newest_job(session: Session, kind: str, plan: str) -> Job | None:
     """Return the newest job of a kind for a plan, or for a playback of it."""
-    mine = select(Job).where(Job.plan == plan, Job.kind == kind)
-    return session.scalar(mine.order_by(Job.row.desc()).limit(1))
+    return session.scalar(newest(Job, Job.plan == plan, Job.kind == kind))

@@ -4,7 +4,6 @@ A *style* is a surgeon's way of sewing one suture type. It is `stored` if it has
 it has a policy version, `released` if a version is served.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -12,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 from sqlalchemy import JSON, ColumnElement, Select, case, exists, func, select, type_coerce
 from sqlalchemy.orm import Session
 
+from skills.db import newest
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release, Surgeon, SutureType
 from skills.library.operation.overview import MOST, MOST_LISTED
 from skills.library.people.surgeons import find_surgeon
@@ -22,6 +22,7 @@ State = Literal["released", "trained", "stored", "empty"]
 STATES: tuple[State, ...] = ("released", "trained", "stored", "empty")
 MOST_COUNTED = 1000  # of a kind, for the figures of the first page
 _Row = tuple[int, str]  # a style: the surgeon's row and the suture type's slug
+_Counts = dict[_Row, tuple[int, int]]  # of each style the number of its demonstrations or versions, and the newest row
 
 
 @dataclass(frozen=True)
@@ -141,20 +142,18 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     def mine(of: Any) -> list[ColumnElement[bool]]:
         return [of.surgeon_row.in_(surgeons), *([] if suture is None else [of.suture == suture])]
 
-    demos, newest_demo = Counter[_Row](), dict[_Row, int]()
-    of = Demonstration
-    newest_of = func.max(case((of.learnable, of.row), else_=0))
-    active = select(of.surgeon_row, of.suture, func.count(), newest_of).where(of.withdrawn_at.is_(None))
-    for who, what, count, newest in session.execute(active.where(*mine(of)).group_by(of.surgeon_row, of.suture)):
-        demos[who, what], newest_demo[who, what] = count, newest
-    versions, newest_version = Counter[_Row](), dict[_Row, int]()
-    by = PolicyVersion
-    learnt = select(by.surgeon_row, by.suture, func.count(), func.max(by.row)).where(*mine(by))
-    for who, what, count, newest in session.execute(learnt.group_by(by.surgeon_row, by.suture)):
-        versions[who, what], newest_version[who, what] = count, newest
+    def counted(of: Any, newest: Any, *which: ColumnElement[bool]) -> _Counts:
+        """Return the number of rows of each style, and the newest of them."""
+        query = select(of.surgeon_row, of.suture, func.count(), newest).where(*mine(of), *which)
+        found = session.execute(query.group_by(of.surgeon_row, of.suture))
+        return {(who, what): (count, last) for who, what, count, last in found}
+
+    of, by = Demonstration, PolicyVersion
+    demos = counted(of, func.max(case((of.learnable, of.row), else_=0)), of.withdrawn_at.is_(None))
+    versions = counted(by, func.max(by.row))
     served = select(Release.surgeon_row, Release.suture, Release.policy_row).where(*mine(Release), is_served())
     released = {(who, what): policy for who, what, policy in session.execute(served)}
-    wanted = {**newest_version, **released}
+    wanted = {style: newest for style, (_, newest) in versions.items()} | released
     # Columns and not entities, of which a page has hundreds; and of manifests the part that is shown.
     shown = [("grid", "shape"), ("waypoints",), ("coverage", "mean_share"), ("metrics", "dtw_total_mm")]
     manifest = [type_coerce(by.manifest, JSON)[names] for names in shown]
@@ -162,32 +161,24 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     about = select(by.row, by.version, by.demonstration_row, others.scalar_subquery(), *manifest)
     told = {row: rest for row, *rest in session.execute(about.where(by.row.in_(wanted.values())))}
     return {
-        style: _sum_up(
-            style,
-            demos[style],
-            versions[style],
-            told.get(wanted.get(style, 0)),
-            newest_demo.get(style, 0),
-            style in released,
-        )
+        style: _sum_up(style, demos, versions, told.get(wanted.get(style, 0)), style in released)
         for style in demos.keys() | versions.keys()
     }
 
 
-def _sum_up(
-    style: _Row, demos: int, versions: int, told: list[Any] | None, newest_demo: int, released: bool
-) -> StyleState:
+def _sum_up(style: _Row, demos: _Counts, versions: _Counts, told: list[Any] | None, released: bool) -> StyleState:
+    count, newest = demos.get(style, (0, 0))
     if told is None:
-        return StyleState(style[1], "stored", demos)
+        return StyleState(style[1], "stored", count)
     version, demonstration_row, other, shape, *shown = told
     return StyleState(
         suture=style[1],
         state="released" if released else "trained",
-        demos=demos,
-        versions=versions,
+        demos=count,
+        versions=versions[style][0],
         released=version if released else None,
         shown=Shown(tuple(shape), *shown),
-        waiting=newest_demo > max(demonstration_row, other or 0),
+        waiting=newest > max(demonstration_row, other or 0),
     )
 
 
@@ -218,19 +209,17 @@ def whole_style(session: Session, surgeon: str, suture: str) -> WholeStyle:
     """
     who, what = find_surgeon(session, surgeon), find_suture_type(session, suture)
 
-    def newest(of: Any) -> Any:
-        mine = select(of).where(of.surgeon_row == who.row, of.suture == what.slug)
-        return session.scalars(mine.order_by(of.row.desc()).limit(MOST_LISTED)).all()
+    def newest_of(of: Any) -> Any:
+        return session.scalars(newest(of, of.surgeon_row == who.row, of.suture == what.slug, limit=MOST_LISTED)).all()
 
-    releases: Sequence[Release] = newest(Release)
     style = _styles(session, [who.row], what.slug).get((who.row, what.slug), StyleState(what.slug, "empty"))
     return WholeStyle(
         surgeon=who,
         suture=what,
         style=style,
-        demos=newest(Demonstration),
-        versions=newest(PolicyVersion),
-        releases=releases,
+        demos=newest_of(Demonstration),
+        versions=newest_of(PolicyVersion),
+        releases=newest_of(Release),
         served=served(session, who, what.slug),
     )
 

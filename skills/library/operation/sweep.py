@@ -9,6 +9,7 @@ steadily for `STEADY_S` (`SteadyClock`): that is the time in which a wrong clock
 """
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import timedelta
@@ -19,15 +20,12 @@ from typing import Any, cast
 from sqlalchemy import Select, Table, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import now
+from skills.db import models, now
 from skills.db.models import (
     AT_ONCE_BYTES,
     CHUNK_BYTES,
     LooseChunks,
-    ParsedChunk,
-    ParsedRecording,
     Plan,
-    RecordingChunk,
     StoredPictures,
     StoredPlayback,
     StoredRecording,
@@ -72,8 +70,7 @@ class SteadyClock:
 
 def sweep_erased(database: Database) -> None:
     """Delete all that is left of erased surgeons, deleted recordings and interrupted uploads."""
-    for _ in _sweep_jobs(database):
-        pass
+    deque(_sweep_jobs(database), maxlen=0)
     while _sweep_chunks(database):
         pass
 
@@ -129,17 +126,17 @@ def drop_contents(database: Database, recordings: Iterable[int]) -> None:
 
 def _drop_content(database: Database, recording_row: int) -> bool:
     """Delete some chunks of a cached content, which is not used from then on; return whether there may be more."""
-    of, at_once = ParsedChunk, AT_ONCE_BYTES // CHUNK_BYTES
-    mine = (of.recording_row == recording_row,)
+    of, entry, at_once = models.ParsedChunk, models.ParsedRecording, AT_ONCE_BYTES // CHUNK_BYTES
     with database.reading() as session:
         sha256 = session.scalar(select(StoredRecording.sha256).where(StoredRecording.row == recording_row))
     if sha256 is None:
         return False
     with database.writing([locks.recording(sha256)]) as session:
-        entry = update(ParsedRecording).where(ParsedRecording.recording_row == recording_row)
-        session.execute(entry.values(version=UNFINISHED), **UNSYNCHRONISED)
-        numbers = session.scalars(select(of.number).where(*mine).order_by(of.number).limit(at_once)).all()
-        session.execute(delete(of).where(*mine, of.number.in_(numbers)), **UNSYNCHRONISED)
+        unfinished = update(entry).where(entry.recording_row == recording_row).values(version=UNFINISHED)
+        session.execute(unfinished, **UNSYNCHRONISED)
+        mine = of.recording_row == recording_row
+        numbers = session.scalars(select(of.number).where(mine).order_by(of.number).limit(at_once)).all()
+        session.execute(delete(of).where(mine, of.number.in_(numbers)), **UNSYNCHRONISED)
         return len(numbers) == at_once
 
 
@@ -150,7 +147,7 @@ def _sweep_chunks(database: Database) -> bool:
         row = session.scalar(select(LooseChunks.recording_row).where(LooseChunks.due_at <= now()).limit(1))
         if row is None:
             return False
-        of = RecordingChunk
+        of = models.RecordingChunk
         some = select(of.number).where(of.recording == row).order_by(of.number).limit(at_once)
         numbers = session.scalars(some, execution_options=ALL_ROWS).all()
         session.execute(delete(of).where(of.recording == row, of.number.in_(numbers)), **UNSYNCHRONISED)

@@ -24,27 +24,26 @@ MOST_STARTS = 20_000  # drawn smoothly by a browser: of a larger grid every seco
 MOST_SAMPLES = 1500  # of a line on a screen: more are not visible
 
 
-def view_of_demo(session: Session, demo: Demonstration) -> dict[str, Any]:
+def view_of_demo(session: Session, demo: Demonstration) -> dict[str, object]:
     """Return a demonstration as it was recorded, as its path in the grid, and as the rewards of Algorithm 1."""
     stored = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == demo.row)).one()
     return _view(demo.demo, demo.path, stored.map)
 
 
-def _view(recorded: Demo, path: GridPath, reward: RewardMap) -> dict[str, Any]:
+def _view(recorded: Demo, path: GridPath, reward: RewardMap) -> dict[str, object]:
     rewards, levels, grid = reward.rewards, reward.levels, path.grid
     special = np.flatnonzero(rewards != levels.other)
-    every = max(1, len(recorded.tip_mm) // MOST_SAMPLES)
     return {
         "frame": recorded.frame,
         "arm": recorded.arm,
         "grid": {"origin_mm": list(grid.origin_mm), "cell_mm": grid.cell_mm, "shape": list(grid.shape)},
-        "recorded_mm": _mm(recorded.tip_mm[::every]),
-        "path_mm": _mm(path.tip_mm),
-        "rewards": {"at_mm": _mm(grid.centres_mm(special)), "of": rewards[special].tolist(), "goal": levels.goal},
+        "recorded_mm": _thinned(recorded.tip_mm),
+        "path_mm": _rounded(path.tip_mm),
+        "rewards": {"at_mm": _rounded(grid.centres_mm(special)), "of": rewards[special].tolist(), "goal": levels.goal},
     }
 
 
-def view_of_version(version: PolicyVersion) -> dict[str, Any]:
+def view_of_version(version: PolicyVersion) -> dict[str, object]:
     """Return the demonstration that a version was learnt from, and for every cell the rollout that starts there."""
     policy, coverage = learnt(version), covered(version)
     grid = policy.path.grid
@@ -59,7 +58,7 @@ def view_of_version(version: PolicyVersion) -> dict[str, Any]:
         "version": version.version,
         "starts": {
             "every": every,
-            "at_mm": _mm(grid.centres_mm(shown)),
+            "at_mm": _rounded(grid.centres_mm(shown)),
             "reaches": coverage.reaches[shown].tolist(),
             "nearest": coverage.joins_nearest[shown].tolist(),
             "moves": moves[shown].tolist(),
@@ -86,28 +85,22 @@ def moves_to_goal(policy: Policy, reaches: NDArray[np.bool_]) -> NDArray[np.int6
     return counted
 
 
-def traces_of(database: Database, recording_sha256: str, tell: Parser) -> dict[str, Any]:
+def traces_of(database: Database, recording_sha256: str, tell: Parser) -> dict[str, object]:
     """Return the signals of a stored recording's arms, jaws and clutch over time."""
     recording = shown_recording(database, recording_sha256, tell).recording
     return {"duration_s": recording.duration_s, "arms": [_arm(recording, arm) for arm in recording.arms]}
 
 
-def _arm(recording: Recording, arm: str) -> dict[str, Any]:
-    motion = recording.motion_of(arm=arm)
+def _arm(recording: Recording, arm: str) -> dict[str, object]:
+    motion, jaw = recording.motion_of(arm=arm), recording.jaw_of(arm)
     seconds, speed = smoothed_speed(recording.seconds(motion.stamps_ns), motion.tip_mm)
-    every = max(1, len(seconds) // MOST_SAMPLES)
-    jaw = recording.jaw_of(arm)
-    told: dict[str, Any] = {
+    return {
         "arm": arm,
         "topic": motion.topic,
-        "speed": {"t_s": _rounded(seconds[::every]), "mm_s": _rounded(speed[::every])},
-        "jaw": None,
+        "speed": {"t_s": _thinned(seconds), "mm_s": _thinned(speed)},
+        "jaw": jaw and {"t_s": _thinned(recording.seconds(jaw.stamps_ns)), "rad": _thinned(jaw.values)},
         "clutch_s": _pressed(recording),
     }
-    if jaw is not None:
-        every = max(1, len(jaw.values) // MOST_SAMPLES)
-        told["jaw"] = {"t_s": _rounded(recording.seconds(jaw.stamps_ns[::every])), "rad": _rounded(jaw.values[::every])}
-    return told
 
 
 def _pressed(recording: Recording) -> list[list[float]]:
@@ -118,11 +111,12 @@ def _pressed(recording: Recording) -> list[list[float]]:
     return _rounded(recording.seconds(spans_ns))
 
 
-def _mm(points: NDArray[Any]) -> list[Any]:
-    """Return points rounded to a thousandth of a millimetre, finer than a screen can show."""
-    return _rounded(np.asarray(points, float))
+def _thinned(values: NDArray[Any]) -> list[Any]:
+    """Return every n-th sample, so that there are not more than a screen can show."""
+    return _rounded(values[:: max(1, len(values) // MOST_SAMPLES)])
 
 
 def _rounded(values: NDArray[Any]) -> list[Any]:
+    """Return numbers rounded to a thousandth, of mm finer than a screen can show."""
     rounded: list[Any] = np.round(values, 3).tolist()
     return rounded

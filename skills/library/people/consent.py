@@ -11,9 +11,9 @@ allowed.
 
 import json
 from datetime import date
-from typing import Literal, Protocol
+from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Text, and_, cast, or_
+from sqlalchemy import ColumnElement, Row, Text, and_, cast, or_
 
 from skills.db import now
 from skills.db.models import Surgeon
@@ -22,20 +22,8 @@ from skills.schemas.people import Consent
 
 Use = Literal["training", "export", "atlas", "any"]  # the last one is covered by each of the others: docs/keys.md
 
-
+Consenting = Surgeon | Row[*tuple[Any, ...]]  # a surgeon, or a row of a query with a surgeon's pseudonym and consent
 CALLED = {"training": "training", "export": "export", "atlas": "atlas", "any": "that this is shown"}
-
-
-class Consenting(Protocol):
-    """A surgeon, or a row of a query with a surgeon's pseudonym and consent."""
-
-    @property
-    def slug(self) -> str:
-        """The pseudonym."""
-
-    @property
-    def consent(self) -> Consent | None:
-        """The recorded consent."""
 
 
 def today() -> date:
@@ -68,8 +56,7 @@ def require(surgeon: Consenting, use: Use) -> None:
     Raises:
         Conflict: The consent does not name the use, or has expired.
     """
-    refused = refusal(surgeon, use)
-    if refused is not None:
+    if (refused := refusal(surgeon, use)) is not None:
         raise refused
 
 

@@ -12,34 +12,12 @@ One transaction erases all that can be seen. Of many jobs and of large recording
 import secrets
 from collections.abc import Sequence
 
-from sqlalchemy import ColumnElement, Select, delete, func, insert, null, select
-from sqlalchemy.orm import Session
+from sqlalchemy import ColumnElement, Select, delete, exists, func, insert, null, select, true
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from skills.db import in_parts, now
+from skills.db import in_parts, models, now
 from skills.db.changes import announce
-from skills.db.models import (
-    AT_ONCE_BYTES,
-    Demonstration,
-    DemonstrationOutcome,
-    ErasedInterval,
-    Erasure,
-    LastUsed,
-    LooseChunks,
-    MeasuredShape,
-    Plan,
-    PolicyDemonstration,
-    PolicyVersion,
-    RecordingChunk,
-    RecordingSurgeon,
-    RecordingUpload,
-    Release,
-    StoredPictures,
-    StoredPlayback,
-    StoredPoses,
-    StoredRecording,
-    StoredRewardMap,
-    Surgeon,
-)
+from skills.db.models import AT_ONCE_BYTES, Demonstration, Plan, PolicyVersion, RecordingSurgeon, Surgeon
 from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import Job, record_event
 from skills.errors import Conflict, NotAllowed
@@ -73,41 +51,50 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> Dropped:
     # Of this surgeon's batches too, whose styles are all of these demonstrations.
     forget_styles(session, select(Demonstration.row).where(of_surgeon), None)
     for some in in_parts([row for row, _ in dropped]):
-        session.execute(delete(Job).where(Job.row.in_(some)), **UNSYNCHRONISED)
+        _delete(session, Job.row, some)
     delete_jobs(session, surgeon.row)
-    named = session.scalars(select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row))
-    _erase(session, of_surgeon, surgeon, {*named})
+    _erase(session, of_surgeon, surgeon, {*session.scalars(_uploaded_for(surgeon))})
     _forget_name(session, surgeon)
     record_event(session, actor, "erase", "surgeon", surgeon.subject, surgeon)
     # A salted digest recognises the pseudonym if somebody uses it again, and cannot be read back.
     salt = secrets.token_hex(32)
-    session.add(Erasure(salt=salt, digest=salted(salt, slug)))
+    session.add(models.Erasure(salt=salt, digest=salted(salt, slug)))
     session.execute(delete(Surgeon).where(Surgeon.row == surgeon.row))
     return dropped
 
 
+def _uploaded_for(surgeon: Surgeon) -> Select[int]:
+    """Return the query of the recordings that were uploaded for a surgeon."""
+    return select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row)
+
+
 def _forget_name(session: Session, surgeon: Surgeon) -> None:
     """Leave intervals without a name in the recordings that stay, so that what the surgeon refused stays refused."""
-    named, gone = RecordingSurgeon, ErasedInterval
+    named, gone = RecordingSurgeon, models.ErasedInterval
     for of, start_s, end_s in ((named, null(), null()), (gone, gone.start_s, gone.end_s)):
         theirs = select(of.recording_row, null(), start_s, end_s).where(of.surgeon_row == surgeon.row)
-        session.execute(insert(ErasedInterval).from_select(INTERVAL, theirs))
+        session.execute(insert(models.ErasedInterval).from_select(INTERVAL, theirs))
         session.execute(delete(of).where(of.surgeon_row == surgeon.row), **UNSYNCHRONISED)
 
 
 def erased_with(session: Session, surgeon: Surgeon, demo: Demonstration | None = None) -> list[int]:
     """Return the rows of the recordings that are erased with a surgeon, or with one of the surgeon's demonstrations."""
-    of, named = Demonstration, RecordingSurgeon
-    which = of.surgeon_row == surgeon.row if demo is None else of.row == demo.row
-    rows = {*session.scalars(select(of.recording_row).where(which))}
+    which = Demonstration.surgeon_row == surgeon.row if demo is None else Demonstration.row == demo.row
+    rows = {*session.scalars(select(Demonstration.recording_row).where(which))}
     if demo is None:
-        rows |= {*session.scalars(select(named.recording_row).where(named.surgeon_row == surgeon.row))}
+        rows |= {*session.scalars(_uploaded_for(surgeon))}
+    return sorted(rows - _shared(session, sorted(rows), surgeon, ~which))
+
+
+def _shared(session: Session, rows: Sequence[int], surgeon: Surgeon, others: ColumnElement[bool]) -> set[int]:
+    """Return the recordings that other demonstrations were cut out of, or that were uploaded for other surgeons."""
+    of, named = Demonstration.recording_row, RecordingSurgeon
     shared: set[int] = set()
-    for some in in_parts(sorted(rows)):
-        shared |= {*session.scalars(select(of.recording_row).where(of.recording_row.in_(some), ~which))}
-        others = select(named.recording_row).where(named.recording_row.in_(some), named.surgeon_row != surgeon.row)
-        shared |= {*session.scalars(others)}
-    return sorted(rows - shared)
+    for some in in_parts(rows):
+        shared |= {*session.scalars(select(of).where(of.in_(some), others))}
+        also = select(named.recording_row).where(named.recording_row.in_(some), named.surgeon_row != surgeon.row)
+        shared |= {*session.scalars(also)}
+    return shared
 
 
 def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
@@ -125,7 +112,7 @@ def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
     demo_sha256 = demo.sha256  # in full: the argument may be a prefix
     withdraw_resting_on(session, demo, actor)  # otherwise the release before the served one would be served again
     of_demo = Demonstration.row == demo.row
-    plans = set(session.scalars(select(Plan.sha256).where(Plan.policy_row.in_(_resting_on(of_demo)))))
+    plans = {*session.scalars(select(Plan.sha256).where(Plan.policy_row.in_(_resting_on(of_demo))))}
     theirs = select(Job.row, Job.attempt, ACTIVE, Job.request).where(Job.surgeon_row == demo.surgeon_row)
     jobs = [
         (row, attempt, active)
@@ -137,7 +124,7 @@ def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
     forget_styles(session, select(Demonstration.row).where(of_demo), None)
     for some in in_parts([row for row, _, _ in jobs]):
         forget_styles(session, None, some)
-        session.execute(delete(Job).where(Job.row.in_(some)), **UNSYNCHRONISED)
+        _delete(session, Job.row, some)
     dropped = [(row, attempt) for row, attempt, active in jobs if active] + _drop_exports(session, of_demo)
     record_event(session, actor, "erase", "demonstration", demo_sha256, demo.surgeon)
     _erase(session, of_demo, demo.surgeon, set())
@@ -148,7 +135,7 @@ def _drop_exports(session: Session, which: ColumnElement[bool], surgeon: Surgeon
     """Delete every dataset in which some demonstrations, or anything of a surgeon's recordings, can be seen."""
     rows = {*session.scalars(exports_of(which))}
     if surgeon is not None:
-        for of in (RecordingSurgeon, ErasedInterval):
+        for of in (RecordingSurgeon, models.ErasedInterval):
             theirs = select(of.recording_row).where(of.surgeon_row == surgeon.row)
             rows |= {*session.scalars(exports_from(theirs))}
     found = select(Job.row, Job.attempt).where(Job.row.in_(rows), ACTIVE)
@@ -173,8 +160,8 @@ def delete_recording(session: Session, recording_sha256: str, actor: str, *, as_
     """
     stored, alone = deletable_recording(session, recording_sha256, actor, as_admin=as_admin)
     if not alone:
-        mine = (RecordingUpload.recording_row == stored.row, RecordingUpload.actor == actor)
-        session.execute(delete(RecordingUpload).where(*mine), **UNSYNCHRONISED)
+        mine = (models.RecordingUpload.recording_row == stored.row, models.RecordingUpload.actor == actor)
+        session.execute(delete(models.RecordingUpload).where(*mine), **UNSYNCHRONISED)
         return
     record_event(session, actor, "erase", "recording", recording_sha256)
     _delete_recordings(session, [stored.row])
@@ -182,17 +169,17 @@ def delete_recording(session: Session, recording_sha256: str, actor: str, *, as_
 
 def deletable_recording(
     session: Session, recording_sha256: str, actor: str, *, as_admin: bool
-) -> tuple[StoredRecording, bool]:
+) -> tuple[models.StoredRecording, bool]:
     """Return the recording that `delete_recording` would delete, and whether it itself and not only an upload of it.
 
     The arguments and errors are those of `delete_recording`.
     """
-    stored = find_recording(session, recording_sha256)
-    senders = set(session.scalars(select(RecordingUpload.actor).where(RecordingUpload.recording_row == stored.row)))
+    stored, of = find_recording(session, recording_sha256), models.RecordingUpload
+    senders = {*session.scalars(select(of.actor).where(of.recording_row == stored.row))}
     if not as_admin and actor not in senders:
         raise NotAllowed("Another user uploaded this recording; that user or an admin can delete it.")
-    resting = select(func.count()).select_from(Demonstration).where(Demonstration.recording_row == stored.row)
-    # The count covers all surgeons: a restricted key must not delete bytes under demonstrations that it cannot see.
+    resting = select(exists().where(Demonstration.recording_row == stored.row))
+    # Also of other surgeons: a restricted key must not delete bytes under demonstrations that it cannot see.
     if session.scalar(resting.execution_options(**ALL_ROWS)):
         why = "Demonstrations, active or withdrawn, depend on this recording."
         raise Conflict(why, Remedy(Action.ERASE_DEMOS))
@@ -202,7 +189,9 @@ def deletable_recording(
 def _resting_on(which: ColumnElement[bool]) -> Select[int]:
     """Return the query of the policies that were learnt from some demonstrations, alone or among others."""
     demos = select(Demonstration.row).where(which)
-    others = select(PolicyDemonstration.policy_row).where(PolicyDemonstration.demonstration_row.in_(demos))
+    others = select(models.PolicyDemonstration.policy_row).where(
+        models.PolicyDemonstration.demonstration_row.in_(demos)
+    )
     return select(PolicyVersion.row).where(PolicyVersion.demonstration_row.in_(demos) | PolicyVersion.row.in_(others))
 
 
@@ -217,40 +206,33 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
     demos = select(Demonstration.row).where(which)
     # Every cached row with distances of the suture type may hold one from an erased demonstration. Shapes alone, of
     # which an index of neighbours has up to 100,000, stay.
-    cached = MeasuredShape.demonstration_row
+    cached = models.MeasuredShape.demonstration_row
     beside = select(Demonstration.row).where(Demonstration.suture.in_(select(Demonstration.suture).where(which)))
-    touched = cached.in_(demos) | (cached.in_(beside) & (MeasuredShape.version >= 0))
-    session.execute(delete(MeasuredShape).where(touched), **UNSYNCHRONISED)
+    touched = cached.in_(demos) | (cached.in_(beside) & (models.MeasuredShape.version >= 0))
+    session.execute(delete(models.MeasuredShape).where(touched), **UNSYNCHRONISED)
     for some in in_parts(policies):
         by = PolicyVersion
         numbers = select(by.surgeon_row, by.suture, func.max(by.version)).where(by.row.in_(some))
         used = numbers.group_by(by.surgeon_row, by.suture)
-        session.execute(insert(LastUsed).from_select(["surgeon_row", "suture", "last"], used))
+        session.execute(insert(models.LastUsed).from_select(["surgeon_row", "suture", "last"], used))
         plans = select(Plan.row).where(Plan.policy_row.in_(some))
-        playbacks = select(StoredPlayback.row).where(StoredPlayback.plan_row.in_(plans))
+        playbacks = select(models.StoredPlayback.row).where(models.StoredPlayback.plan_row.in_(plans))
         # From the leaves to the roots, because of the foreign keys.
-        for statement in (
-            delete(StoredPictures).where(StoredPictures.playback_row.in_(playbacks)),
-            delete(StoredPlayback).where(StoredPlayback.plan_row.in_(plans)),
-            delete(Plan).where(Plan.policy_row.in_(some)),
-            delete(Release).where(Release.policy_row.in_(some)),
-            delete(PolicyDemonstration).where(PolicyDemonstration.policy_row.in_(some)),
-            delete(StoredPoses).where(StoredPoses.policy_row.in_(some)),
-            delete(PolicyVersion).where(PolicyVersion.row.in_(some)),
-        ):
-            session.execute(statement, **UNSYNCHRONISED)
-    for of in (StoredRewardMap, DemonstrationOutcome):
-        session.execute(delete(of).where(of.demonstration_row.in_(demos)), **UNSYNCHRONISED)
+        _delete(session, models.StoredPictures.playback_row, playbacks)
+        _delete(session, models.StoredPlayback.plan_row, plans)
+        for of_policy in (Plan, models.Release, models.PolicyDemonstration, models.StoredPoses):
+            _delete(session, of_policy.policy_row, some)
+        _delete(session, PolicyVersion.row, some)
+    for of_demo in (models.StoredRewardMap, models.DemonstrationOutcome):
+        _delete(session, of_demo.demonstration_row, demos)
     mine = Demonstration
     seconds = select(mine.recording_row, mine.surgeon_row, mine.start_s, mine.end_s).where(which)
-    session.execute(insert(ErasedInterval).from_select(INTERVAL, seconds))  # deleted with a recording that is unused
+    # Deleted with a recording that is unused.
+    session.execute(insert(models.ErasedInterval).from_select(INTERVAL, seconds))
     session.execute(delete(mine).where(which), **UNSYNCHRONISED)
     for some in in_parts(sorted(recordings)):
-        cut = select(Demonstration.recording_row).where(Demonstration.recording_row.in_(some))
-        others = select(RecordingSurgeon.recording_row).where(
-            RecordingSurgeon.recording_row.in_(some), RecordingSurgeon.surgeon_row != surgeon.row
-        )
-        _delete_recordings(session, sorted({*some} - {*session.scalars(cut)} - {*session.scalars(others)}))
+        shared = _shared(session, some, surgeon, true())
+        _delete_recordings(session, sorted({*some} - shared))
 
 
 def _delete_recordings(session: Session, rows: Sequence[int]) -> None:
@@ -258,9 +240,15 @@ def _delete_recordings(session: Session, rows: Sequence[int]) -> None:
 
     The bytes of many or large ones are left to the sweep.
     """
-    size = select(func.coalesce(func.sum(StoredRecording.size_bytes), 0)).where(StoredRecording.row.in_(rows))
+    of = models.StoredRecording
+    size = select(func.coalesce(func.sum(of.size_bytes), 0)).where(of.row.in_(rows))
     if (session.scalar(size.execution_options(**ALL_ROWS)) or 0) <= AT_ONCE_BYTES:
-        session.execute(delete(RecordingChunk).where(RecordingChunk.recording.in_(rows)), **UNSYNCHRONISED)
+        _delete(session, models.RecordingChunk.recording, rows)
     else:
-        session.add_all(LooseChunks(recording_row=row, due_at=now()) for row in rows)
-    session.execute(delete(StoredRecording).where(StoredRecording.row.in_(rows)), **UNSYNCHRONISED)
+        session.add_all(models.LooseChunks(recording_row=row, due_at=now()) for row in rows)
+    _delete(session, of.row, rows)
+
+
+def _delete(session: Session, column: InstrumentedAttribute[int], values: Sequence[int] | Select[int]) -> None:
+    """Delete the rows of a table whose column has one of these values."""
+    session.execute(delete(column.class_).where(column.in_(values)), **UNSYNCHRONISED)

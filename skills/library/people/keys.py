@@ -20,7 +20,7 @@ from functools import lru_cache
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from skills.db import now
+from skills.db import in_parts, now
 from skills.db.history import HISTORY
 from skills.db.leaves import LEAVES
 from skills.db.row_visibility import Only
@@ -38,6 +38,7 @@ SECRET_BYTES = 32
 KEYS_AT_ONCE = 500  # looked up in one query
 SHAPE = re.compile(r"skills_([0-9a-f]{8})_[A-Za-z0-9_-]{43}")
 OURS = frozenset({"local", "seeds", "restore", "worker"})  # actors in events that are not owners of keys
+_only = lru_cache(256)(Only)  # the SQL rules of an `Only` are compiled once, not at every look-up
 
 
 @dataclass(frozen=True)
@@ -154,10 +155,9 @@ def holders_of(session: Session, texts: Iterable[str]) -> dict[str, Holder]:
     """
     found: dict[str, Holder] = {}
     shapes = [shape for shape in map(SHAPE.fullmatch, texts) if shape is not None]
-    for at in range(0, len(shapes), KEYS_AT_ONCE):
-        some = shapes[at : at + KEYS_AT_ONCE]
-        rows = session.scalars(select(Key).where(Key.id.in_({shape[1] for shape in some})))
-        keys = {key.id: key for key in written_by_service(session, [key for key in rows if key.revoked_at is None])}
+    for some in in_parts(shapes, KEYS_AT_ONCE):
+        rows = session.scalars(select(Key).where(Key.id.in_({shape[1] for shape in some}), Key.revoked_at.is_(None)))
+        keys = {key.id: key for key in written_by_service(session, rows.all())}
         for shape in some:
             key = keys.get(shape[1])
             # Compared in constant time, so that timing does not reveal the digest.
@@ -168,12 +168,12 @@ def holders_of(session: Session, texts: Iterable[str]) -> dict[str, Holder]:
 
 def written_by_service(session: Session, keys: Sequence[Key]) -> list[Key]:
     """Return the keys that nobody else than the service has written; each edited one is logged."""
-    seen = {f"{key.row}/{surgeon.row}": key for key in keys for surgeon in key.surgeons if key.restricted}
+    of_keys = {str(key.row): key for key in keys}
+    of_surgeons = {f"{key.row}/{one.row}": key for key in keys if key.restricted for one in key.surgeons}
     history, connection = session.info[HISTORY], session.connection()
-    wrong = edited_rows(connection, history, Key.__tablename__, [str(key.row) for key in keys])
-    wrong += edited_rows(connection, history, KeySurgeon.__tablename__, [*seen])
-    rows = {int(key.partition("/")[0]) for key in wrong}
-    return [key for key in keys if key.row not in rows]
+    wrong = [of_keys[row] for row in edited_rows(connection, history, Key.__tablename__, list(of_keys))]
+    wrong += [of_surgeons[row] for row in edited_rows(connection, history, KeySurgeon.__tablename__, list(of_surgeons))]
+    return [key for key in keys if key not in wrong]
 
 
 def held(key: Key) -> Holder:
@@ -206,8 +206,3 @@ def is_owner(name: str) -> bool:
 def digest_of(text: str) -> str:
     """Return the digest under which a secret is stored."""
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-@lru_cache(256)  # the SQL rules of an `Only` are compiled once, not at every look-up
-def _only(owner: str, rows: frozenset[int]) -> Only:
-    return Only(owner, rows)

@@ -15,7 +15,7 @@ from datetime import timedelta
 from sqlalchemy import delete, or_, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import now
+from skills.db import in_parts, now
 from skills.db.history import HISTORY
 from skills.db.service_tables import Key, SignIn, record_event
 from skills.library.operation.history import edited_rows
@@ -51,14 +51,12 @@ def signed_in(session: Session, cookies: Iterable[str], lasts: SignInLifetime) -
     """
     holders: dict[str, tuple[Holder, bool]] = {}
     by_digest = {digest_of(cookie): cookie for cookie in cookies}
-    digests, at = list(by_digest), now()
-    for first in range(0, len(digests), KEYS_AT_ONCE):
-        rows = session.scalars(select(SignIn).where(SignIn.digest.in_(digests[first : first + KEYS_AT_ONCE]))).all()
+    at = now()
+    for some in in_parts(list(by_digest), KEYS_AT_ONCE):
+        rows = session.scalars(select(SignIn).where(SignIn.digest.in_(some))).all()
         names = [found.digest for found in rows]
         edited = edited_rows(session.connection(), session.info[HISTORY], SignIn.__tablename__, names)
-        keys = {
-            key.row for key in written_by_service(session, list({found.key.row: found.key for found in rows}.values()))
-        }
+        keys = {key.row for key in written_by_service(session, list({found.key for found in rows}))}
         for found in rows:
             if found.digest in edited or found.key_row not in keys:
                 continue

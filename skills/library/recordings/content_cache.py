@@ -18,7 +18,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from sqlalchemy import delete, select, update
+from sqlalchemy import delete, insert, select, update
 from sqlalchemy.orm import Session
 
 from skills import packing
@@ -71,9 +71,9 @@ class Entry:
         """True if it takes more than one transaction to store it."""
         return len(self.data) > AT_ONCE_BYTES
 
-    def chunks(self, start: int = 0, end: int | None = None) -> Iterator[tuple[int, bytes]]:
-        """Yield the chunks between two bytes, with their numbers."""
-        for at in range(start, len(self.data) if end is None else min(end, len(self.data)), CHUNK_BYTES):
+    def chunks(self, start: int) -> Iterator[tuple[int, bytes]]:
+        """Yield `AT_ONCE_BYTES` of chunks from a byte on, with their numbers."""
+        for at in range(start, min(start + AT_ONCE_BYTES, len(self.data)), CHUNK_BYTES):
             yield at // CHUNK_BYTES, bytes(self.data[at : at + CHUNK_BYTES])
 
 
@@ -89,18 +89,15 @@ def entry_of(source: Source, parsed: ParsedContent) -> Entry | None:
 
 
 def put_entry(session: Session, recording_row: int, entry: Entry) -> None:
-    """Store the entry of a recording, in place of any other."""
+    """Store the entry of a recording, unless it is large, in place of any other."""
     _replace(session, recording_row, entry, READER_VERSION)
-    for number, piece in entry.chunks():
-        session.add(ParsedChunk(recording_row=recording_row, number=number, data=piece))
-        session.flush()
+    _add_missing(session, recording_row, entry, 0)
 
 
 def _replace(session: Session, recording_row: int, entry: Entry, version: int) -> None:
     session.execute(delete(ParsedRecording).where(ParsedRecording.recording_row == recording_row))
-    row = ParsedRecording(recording_row=recording_row, version=version, reading=entry.reading, sha256=entry.sha256)
-    session.add(row)
-    session.flush()
+    about = {"version": version, "reading": entry.reading, "sha256": entry.sha256}
+    session.execute(insert(ParsedRecording), {"recording_row": recording_row, **about})
 
 
 def cache_content(database: Database, stored: StoredRecording, entry: Entry) -> None:
@@ -138,10 +135,9 @@ def _add_missing(session: Session, recording_row: int, entry: Entry, start: int)
     of = ParsedChunk
     known = select(of.number).where(of.recording_row == recording_row, of.number >= start // CHUNK_BYTES)
     there = set(session.scalars(known))
-    for number, piece in entry.chunks(start, start + AT_ONCE_BYTES):
+    for number, piece in entry.chunks(start):
         if number not in there:
-            session.add(ParsedChunk(recording_row=recording_row, number=number, data=piece))
-            session.flush()
+            session.execute(insert(of), {"recording_row": recording_row, "number": number, "data": piece})
 
 
 def is_cached(session: Session, stored: StoredRecording) -> bool:

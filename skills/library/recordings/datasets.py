@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import file_digest
 from json import load
 from shutil import copyfileobj
@@ -30,7 +31,6 @@ from skills.db import in_parts
 from skills.db.models import CHUNK_BYTES, SUCCESS, Demonstration, StoredRecording, Surgeon, SutureType
 from skills.db.service_tables import DatasetChunk, DatasetDemonstration, Job, StoredDataset, record_event, record_events
 from skills.db.session import Database
-from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Conflict, NotFound, TooLarge
 from skills.formats.lerobot import INFO
 from skills.formats.lerobot.writer import (
@@ -59,6 +59,7 @@ from skills.schemas.results import DatasetResult
 from skills.settings import Settings
 
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once
+MARKED: tuple[Split, ...] = ("recovery", "failure")  # the splits of demonstrations that are marked so
 PROGRESS_S = 0.5  # progress is stored about so often, each time in a transaction
 
 _EXPORTED, _DEMOS = (cast(Table, one.__table__).alias() for one in (DatasetDemonstration, Demonstration))
@@ -96,10 +97,6 @@ class _Chosen(NamedTuple):
     surgeon_row: int
     withdrawn_at: object
     outcome: str | None
-
-    @property
-    def failed(self) -> bool:
-        return self.outcome not in (None, SUCCESS)
 
 
 def request_dataset(session: Session, asked: DatasetIn, actor: str) -> RequestedJob:
@@ -146,7 +143,8 @@ def _chosen(session: Session, asked: DatasetIn) -> list[_Chosen]:
         if len({*rows}) < len(rows):
             raise BadInput("A demonstration is named twice; name each once.")
         found = [_Chosen(*one) for some in in_parts(rows) for one in session.execute(query.where(of.row.in_(some)))]
-        _refuse_unfit(found, any_outcome=asked.outcomes == "any")
+        for one in found:
+            _refuse_unfit(one, any_outcome=asked.outcomes == "any")
         return found
     query = query.where(of.withdrawn_at.is_(None) if asked.outcomes == "any" else of.learnable)
     if asked.surgeons is not None:
@@ -161,15 +159,14 @@ def _chosen(session: Session, asked: DatasetIn) -> list[_Chosen]:
     return found
 
 
-def _refuse_unfit(found: Sequence[_Chosen], *, any_outcome: bool) -> None:
-    for one in found:
-        if one.withdrawn_at is not None:
-            raise Conflict(f"The demonstration {one.sha256[:12]} was withdrawn; leave it out.")
-        if one.failed and not any_outcome:
-            raise Conflict(
-                f"The demonstration {one.sha256[:12]} is marked {one.outcome}; leave it out, or export it with "
-                "outcomes 'any', in a split of its own."
-            )
+def _refuse_unfit(one: _Chosen, *, any_outcome: bool) -> None:
+    if one.withdrawn_at is not None:
+        raise Conflict(f"The demonstration {one.sha256[:12]} was withdrawn; leave it out.")
+    if one.outcome not in (None, SUCCESS, *(MARKED if any_outcome else ())):
+        raise Conflict(
+            f"The demonstration {one.sha256[:12]} is marked {one.outcome}; leave it out, or export it with "
+            "outcomes 'any', in a split of its own."
+        )
 
 
 def _splits(chosen: Sequence[_Chosen], asked: DatasetIn) -> dict[int, Split]:
@@ -178,16 +175,14 @@ def _splits(chosen: Sequence[_Chosen], asked: DatasetIn) -> dict[int, Split]:
     A failure or a recovery is in the split of this name, and of a whole recording all demonstrations with it.
     """
     episode = {one.row: one.recording_row if asked.whole else one.row for one in chosen}
-    marked: dict[int, Split] = {}
-    for outcome in ("recovery", "failure"):  # of both, the failure counts
-        marked |= {episode[one.row]: cast(Split, outcome) for one in chosen if one.outcome == outcome}
+    split: dict[int, Split] = {}  # by episode
+    for outcome in MARKED:  # of both, the failure counts
+        split |= {episode[one.row]: outcome for one in chosen if one.outcome == outcome}
     groups = _groups(chosen, asked)
-    left = {episode[one.row]: groups[one.row] for one in chosen if episode[one.row] not in marked}
-    of_group = splits_by_surgeon({f"{group:020}": episodes for group, episodes in Counter(left.values()).items()})
-    return {
-        one.row: marked[at] if (at := episode[one.row]) in marked else of_group[f"{groups[one.row]:020}"]
-        for one in chosen
-    }
+    left = {episode[one.row]: f"{groups[one.row]:020}" for one in chosen if episode[one.row] not in split}
+    of_group = splits_by_surgeon(Counter(left.values()))
+    split |= {at: of_group[group] for at, group in left.items()}
+    return {one.row: split[episode[one.row]] for one in chosen}
 
 
 def _groups(chosen: Sequence[_Chosen], asked: DatasetIn) -> dict[int, int]:
@@ -253,8 +248,7 @@ def describe_consents(surgeons: Sequence[Surgeon]) -> str:
     ends = [day for one in agreed if (day := consent.last_day(one.consent)) is not None]
     until = f"; the first of these consents ends on {min(ends)}" if ends else ""
     words = [f"Surgeons recorded: {len(surgeons)}."]
-    if agreed:
-        words.append(f"Agreed to an export: {len(agreed)}{until}.")
+    words += [f"Agreed to an export: {len(agreed)}{until}."] if agreed else []
     if rest := len(surgeons) - len(agreed):
         words.append(f"Without a recorded consent, so that the protocol of the study decides: {rest}.")
     return " ".join(words)
@@ -274,15 +268,6 @@ class _Episode:
     interval_s: tuple[float, float] | None
 
 
-@dataclass(frozen=True)
-class _Written:
-    """A written zip: its size, its digest, and the number of frames in it."""
-
-    size_bytes: int
-    sha256: str
-    frames: int
-
-
 def export_dataset(database: Database, request: DatasetRequest, settings: Settings) -> Store[DatasetResult]:
     """Write the zip of a dataset to a temporary file; the returned function stores it.
 
@@ -297,14 +282,14 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
             raise Conflict("The export was cancelled.")
         require_exportable(session, job)
         row, export, episodes = job.row, job.id, _episodes(session, job.row)
+    unit = "whole recording" if request.whole else "needle hand-off, cut out of a recording"
     about = AboutDataset(
         name=request.name,
         arms=tuple(request.arms),
         fps=request.fps,
         licence=request.licence,
         consent=request.consent,
-        description=f"{request.description} Each episode is "
-        + ("one whole recording." if request.whole else "one needle hand-off, cut out of a recording."),
+        description=f"{request.description} Each episode is one {unit}.",
         procedure=request.procedure,
         split_by=request.split,
         export=export,
@@ -316,25 +301,25 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         with closing(read.server):  # it starts at the first recording that is not cached
             # Read once more than written: whether all episodes have setpoints is known after the last one.
             rule = action_rule(_exported(database, read.parse, episodes, lambda _: tell(0.0)), about)
-            exported = _exported(database, read.parse, episodes, tell)
             about = replace(about, action=rule)
-            made = write_dataset(file, exported, about, request.version, settings)
+            exported = _exported(database, read.parse, episodes, tell)
+            frames = write_dataset(file, exported, about, request.version, settings)
+        size_bytes = file.tell()
+        file.seek(0)
+        made = file_digest(file, "sha256").hexdigest()
         until_stored = opened.pop_all()
 
     def store(session: Session, actor: str) -> DatasetResult:
         job = session.get_one(Job, row)
         surgeons = require_exportable(session, job)
-        dataset = StoredDataset(sha256=made.sha256, job_row=row, size_bytes=made.size_bytes)
+        dataset = StoredDataset(sha256=made, job_row=row, size_bytes=size_bytes)
         session.add(dataset)
         session.flush()
         file.seek(0)
-        number = 0
-        while data := file.read(CHUNK_BYTES):
+        for number, data in enumerate(iter(partial(file.read, CHUNK_BYTES), b"")):
             session.execute(insert(DatasetChunk), {"dataset_row": dataset.row, "number": number, "data": data})
-            number += 1
-        record_events(session, actor, "export", EXPORT, [(made.sha256, surgeon) for surgeon in surgeons])
-        counts = {"size_bytes": made.size_bytes, "episodes": len(episodes), "frames": made.frames}
-        return DatasetResult(dataset=made.sha256, **counts)
+        record_events(session, actor, "export", EXPORT, [(made, surgeon) for surgeon in surgeons])
+        return DatasetResult(dataset=made, size_bytes=size_bytes, episodes=len(episodes), frames=frames)
 
     weakref.finalize(store, until_stored.close)  # and not at its end: a cancelled export is never stored
     return store
@@ -342,30 +327,22 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
 
 def _episodes(session: Session, job_row: int) -> list[_Episode]:
     """Return the episodes of an export, in the order of their splits, those of one recording after each other."""
-    exported, of = DatasetDemonstration, Demonstration
-    query = (
-        select(
-            *(exported.split, exported.whole, of.row, of.sha256, of.recording_row, of.start_s, of.end_s),
-            StoredRecording.sha256.label("recording"),
-            SutureType.name.label("suture"),
-        )
-        .select_from(exported)
-        .join(of, of.row == exported.demonstration_row)
-        .join(StoredRecording, StoredRecording.row == of.recording_row)
-        .join(SutureType, SutureType.slug == of.suture)
-        .where(exported.job_row == job_row)
-    )
+    exported, of, recorded = DatasetDemonstration, Demonstration, StoredRecording
+    columns = (exported.split, exported.whole, of.row, of.sha256, of.recording_row, of.start_s, of.end_s)
+    query = select(*columns, recorded.sha256.label("recording"), SutureType.name.label("suture")).select_from(exported)
+    query = query.join(of, of.row == exported.demonstration_row).join(recorded, recorded.row == of.recording_row)
+    query = query.join(SutureType, SutureType.slug == of.suture).where(exported.job_row == job_row)
     found: dict[tuple[int, ...], list[Any]] = {}
     for one in session.execute(query.order_by(of.recording_row, of.start_s, of.row)):
         key = (one.recording_row,) if one.whole else (one.recording_row, one.row)
         found.setdefault(key, []).append(one)
     episodes = [
         _Episode(
-            some[0].recording,
-            some[0].split,
-            ", ".join(sorted({one.suture for one in some})),
-            tuple(one.sha256 for one in some),
-            None if some[0].whole else (some[0].start_s, some[0].end_s),
+            recording=some[0].recording,
+            split=some[0].split,
+            task=", ".join(sorted({one.suture for one in some})),
+            demos=tuple(one.sha256 for one in some),
+            interval_s=None if some[0].whole else (some[0].start_s, some[0].end_s),
         )
         for some in found.values()
     ]
@@ -387,21 +364,18 @@ def _exported(
                 recording, at = stored_recording(database, episode.recording, read).recording, episode.recording
             except NotFound:
                 raise NotFound("A recording of the export was erased meanwhile; request it again.") from None
-        yield _part(recording, episode)
-
-
-def _part(recording: Recording, episode: _Episode) -> ExportedEpisode:
-    whole = ExportedEpisode(recording, episode.task, episode.split, source=f"demonstration {episode.demos[0][:12]}")
-    if episode.interval_s is None:
-        return whole
-    start_ns, end_ns = (recording.origin_ns + round(1e9 * one) for one in episode.interval_s)
-    return replace(whole, start_ns=start_ns, end_ns=end_ns)
+        source = f"demonstration {episode.demos[0][:12]}"
+        spans = {
+            name: recording.origin_ns + round(1e9 * at_s)
+            for name, at_s in zip(("start_ns", "end_ns"), episode.interval_s or (), strict=False)
+        }
+        yield ExportedEpisode(recording, episode.task, episode.split, source=source, **spans)
 
 
 def write_dataset(
     file: IO[bytes], episodes: Iterable[ExportedEpisode], about: AboutDataset, version: Version, settings: Settings
-) -> _Written:
-    """Write a dataset as a zip into an empty file.
+) -> int:
+    """Write a dataset as a zip into an empty file; return the number of its frames.
 
     Nothing is compressed, because Parquet is already; and members have no date, so that a second attempt at a job
     writes the same bytes.
@@ -421,9 +395,7 @@ def write_dataset(
                 raise TooLarge(
                     f"The dataset is larger than {settings.max_dataset_bytes} bytes; export fewer demonstrations."
                 )
-    size = file.tell()
-    file.seek(0)
-    return _Written(size, file_digest(file, "sha256").hexdigest(), frames)  # type: ignore[arg-type]
+    return frames
 
 
 # ---- stored datasets -----------------------------------------------------------------------------------------------

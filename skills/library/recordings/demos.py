@@ -11,15 +11,8 @@ import numpy as np
 from sqlalchemy import Table, select
 from sqlalchemy.orm import Session
 
-from skills.db import now
-from skills.db.models import (
-    Demonstration,
-    DemonstrationOutcome,
-    RecordingChunk,
-    Release,
-    StoredRecording,
-    StoredRewardMap,
-)
+from skills.db import models, newest, now
+from skills.db.models import Demonstration
 from skills.db.packed import digest
 from skills.db.service_tables import record_event
 from skills.db.session import Database
@@ -30,7 +23,7 @@ from skills.gridworld import reward
 from skills.gridworld.grid import GridPath, choose_grid, discretize
 from skills.gridworld.reward import sparse_reward
 from skills.library.operation import locks
-from skills.library.operation.integrity import demo_identity, find_by_digest
+from skills.library.operation.integrity import OF_DEMO, demo_identity, find_by_digest
 from skills.library.people import consent
 from skills.library.people.recorded import episodes_of, in_recording, recorded_in
 from skills.library.people.surgeons import find_surgeon
@@ -40,6 +33,7 @@ from skills.library.recordings.parts import choose_part
 from skills.library.recordings.recordings import (
     Parser,
     Upload,
+    chunks_of,
     find_recording,
     read_upload,
     store_upload,
@@ -106,7 +100,7 @@ def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, par
     parsed = read_upload(upload, parse)
     made = make_demo(parsed, cut)
 
-    def store(session: Session, stored: StoredRecording, _: bool) -> Added:
+    def store(session: Session, stored: models.StoredRecording, _: bool) -> Added:
         return _store_demo(session, stored, made, cut, actor)
 
     return store_upload(database, upload, parsed, actor, [locks.surgeon(cut.surgeon)], store)
@@ -131,7 +125,7 @@ def _check_style(database: Database, cut: DemoIn) -> None:
         find_suture_type(session, cut.suture)
 
 
-def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: DemoIn, actor: str) -> Added:
+def _store_demo(session: Session, stored: models.StoredRecording, made: Made, cut: DemoIn, actor: str) -> Added:
     surgeon, suture = find_surgeon(session, cut.surgeon), find_suture_type(session, cut.suture)
     demo_sha256 = demo_identity(stored.sha256, surgeon.slug, suture.slug, made.demo, made.path)
     known = session.scalar(select(Demonstration).where(Demonstration.sha256 == demo_sha256))
@@ -146,12 +140,7 @@ def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: Demo
         recording=stored,
         surgeon=surgeon,
         suture=suture.slug,
-        arm=made.demo.arm,
-        topic=made.demo.topic,
-        frame=made.demo.frame,
-        instrument=made.demo.instrument,
-        start_s=made.demo.start_s,
-        end_s=made.demo.end_s,
+        **{name: getattr(made.demo, name) for name in OF_DEMO},
         session=cut.session,
         hysteresis=made.path.hysteresis,
         demo=made.demo,
@@ -161,7 +150,8 @@ def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: Demo
     )
     session.add(demonstration)
     session.flush()
-    session.add(StoredRewardMap(sha256=digest(made.reward), demonstration_row=demonstration.row, map=made.reward))
+    map_sha256 = digest(made.reward)
+    session.add(models.StoredRewardMap(sha256=map_sha256, demonstration_row=demonstration.row, map=made.reward))
     record_event(session, actor, "add", "demonstration", demo_sha256, surgeon)
     _mark(session, demonstration, cut.outcome, cut.outcome_reason, actor)
     return Added(demonstration, True, made.segment)
@@ -207,7 +197,7 @@ def demo_for(session: Session, demo_sha256: str, use: consent.Use) -> Demonstrat
     return demo
 
 
-def exported_recording(session: Session, demo_sha256: str) -> StoredRecording:
+def exported_recording(session: Session, demo_sha256: str) -> models.StoredRecording:
     """Return the recording of a demonstration, for an export of its bytes.
 
     Raises:
@@ -225,8 +215,7 @@ def exported_chunk(database: Database, demo_sha256: str, number: int) -> bytes |
     """
     with database.reading() as session:
         row = exported_recording(session, demo_sha256).row
-        of = RecordingChunk.recording == row, RecordingChunk.number == number
-        return session.scalar(select(RecordingChunk.data).where(*of))
+        return session.scalar(chunks_of(row).where(models.RecordingChunk.number == number))
 
 
 def newest_demo(session: Session, surgeon_row: int, suture: str) -> Demonstration | None:
@@ -248,9 +237,8 @@ def newest_demos(
     """
     of = Demonstration
     wanted = of.withdrawn_at.is_(None) if any_outcome else of.learnable
-    found = select(of).where(of.surgeon_row == surgeon_row, of.suture == suture, wanted)
-    # Selected from the newest back, returned from the oldest on.
-    return list(session.scalars(found.order_by(of.row.desc()).limit(most)))[::-1]
+    found = newest(of, of.surgeon_row == surgeon_row, of.suture == suture, limit=most).where(wanted)
+    return list(session.scalars(found))[::-1]
 
 
 def list_demos(
@@ -275,26 +263,24 @@ def list_demos(
         active: List only active ones, or only withdrawn ones.
         outcome: List only those of this outcome.
     """
-    query = select(Demonstration).order_by(Demonstration.row.desc()).limit(limit)
-    if before is not None:
-        query = query.where(Demonstration.row < before)
+    of, query = Demonstration, newest(Demonstration, limit=limit, before=before)
     if surgeon is not None:
-        query = query.where(Demonstration.surgeon_row == find_surgeon(session, surgeon).row)
+        query = query.where(of.surgeon_row == find_surgeon(session, surgeon).row)
     if suture is not None:
-        query = query.where(Demonstration.suture == find_suture_type(session, suture).slug)
+        query = query.where(of.suture == find_suture_type(session, suture).slug)
     if recording is not None:
-        query = query.where(Demonstration.recording_row == find_recording(session, recording).row)
+        query = query.where(of.recording_row == find_recording(session, recording).row)
     if active is not None:
-        query = query.where(Demonstration.withdrawn_at.is_(None) if active else Demonstration.withdrawn_at.is_not(None))
+        query = query.where(of.withdrawn_at.is_(None) if active else of.withdrawn_at.is_not(None))
     if outcome is not None:
-        query = query.where(Demonstration.outcome == (None if outcome == "unknown" else outcome))
+        query = query.where(of.outcome == (None if outcome == "unknown" else outcome))
         if outcome != "unknown":  # found by the marks, which are few, and not by asking every demonstration for its own
-            marks = cast(Table, DemonstrationOutcome.__table__).c
-            query = query.where(Demonstration.row.in_(select(marks.demonstration_row).where(marks.outcome == outcome)))
+            marks = cast(Table, models.DemonstrationOutcome.__table__).c
+            query = query.where(of.row.in_(select(marks.demonstration_row).where(marks.outcome == outcome)))
     return session.scalars(query).all()
 
 
-def withdraw_demo(session: Session, demo_sha256: str, actor: str) -> list[Release]:
+def withdraw_demo(session: Session, demo_sha256: str, actor: str) -> list[models.Release]:
     """Withdraw a demonstration and return the releases withdrawn with it; a repetition withdraws nothing more."""
     demonstration = find_demo(session, demo_sha256)
     if demonstration.withdrawn_at is None:
@@ -331,7 +317,7 @@ def _mark(
 ) -> None:
     if outcome is not None:
         mark = {"outcome": outcome, "reason": reason, "actor": actor}
-        session.add(DemonstrationOutcome(demonstration_row=demonstration.row, **mark))
+        session.add(models.DemonstrationOutcome(demonstration_row=demonstration.row, **mark))
         record_event(session, actor, MARKS[outcome], "demonstration", demonstration.sha256, demonstration.surgeon)
         session.flush()
     session.refresh(demonstration, ["outcome", "outcome_reason"])
@@ -354,7 +340,8 @@ def path_of_demo(row: Demonstration) -> DemoPath:
 
 def reward_map_of(session: Session, row: Demonstration) -> RewardMap:
     """Return the reward map of a demonstration: the states whose reward is not `other`."""
-    stored = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == row.row)).one()
+    of = models.StoredRewardMap
+    stored = session.scalars(select(of).where(of.demonstration_row == row.row)).one()
     rewards, levels = stored.map.rewards, stored.map.levels
     special = np.flatnonzero(rewards != levels.other)
     return RewardMap(

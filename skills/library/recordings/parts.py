@@ -1,7 +1,7 @@
 """The part of a recording that a demonstration is cut from, chosen by the request or among the proposed hand-offs."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from skills.demonstration.segments import Segment
 from skills.errors import BadSegment, SegmentNotNamed
@@ -52,7 +52,7 @@ def _proposal(cut: DemoIn, proposed: Sequence[Segment], number: int) -> ChosenPa
     return ChosenPart(part, f"proposal {number} of {len(proposed)}", f"{why}: {one.reason}")
 
 
-def _numbered(proposed: Sequence[Segment]) -> list[dict[str, Any]]:  # JSON, in the numbers of a refusal
+def _numbered(proposed: Sequence[Segment]) -> list[dict[str, object]]:  # JSON, in the numbers of a refusal
     """Return proposals with their numbers, the first `MOST`."""
     return [
         {"segment": number, "arm": one.arm, "start_s": one.start_s, "end_s": one.end_s, "reason": one.reason}

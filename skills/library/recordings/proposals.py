@@ -225,25 +225,22 @@ def decide(
 
 def describe_proposal(one: Proposal) -> described.Proposal:
     """Return a proposal as it is sent to clients."""
-    demo, segment = one.demo, one.segment
-    note = one.mark.note if one.mark is not None and one.state == "rejected" else None
+    demo, note = one.demo, None
+    if demo is not None:
+        note = demo.outcome_reason
+    elif one.mark is not None and one.state == "rejected":
+        note = one.mark.note
     return described.Proposal(
         recording=one.recording.sha256,
         number=one.number,
         state=one.state,
-        arm=segment.arm,
-        start_s=segment.start_s,
-        end_s=segment.end_s,
-        handover_s=segment.handover_s,
-        found_by=segment.found_by,
-        reasons=list(segment.reasons),
-        confidence=segment.confidence,
         surgeon=one.surgeon,
         suture=None if demo is None else demo.suture,
         demo=None if demo is None else demo.sha256,
         outcome=None if demo is None else demo.outcome,
-        note=note if demo is None else demo.outcome_reason,
+        note=note,
         created_at=one.recording.created_at,
+        **vars(one.segment),
     )
 
 

@@ -13,7 +13,7 @@ from datetime import timedelta
 from functools import partial
 from typing import BinaryIO, TypeVar
 
-from sqlalchemy import delete, select, text, update
+from sqlalchemy import Select, delete, select, text, update
 from sqlalchemy.orm import Session
 
 from skills.db import now
@@ -383,8 +383,7 @@ def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes
         Corrupt: The digest differs; the last chunk is then withheld.
     """
     seen, held = hashlib.sha256(), b""
-    query = select(RecordingChunk.data).where(RecordingChunk.recording == stored.row).order_by(RecordingChunk.number)
-    for data in session.scalars(query.execution_options(yield_per=1)):
+    for data in session.scalars(chunks_of(stored.row).execution_options(yield_per=1)):
         # One chunk behind, so that the last one is only yielded after the digest was verified.
         if held:
             yield held
@@ -393,6 +392,12 @@ def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes
     if seen.hexdigest() != stored.sha256:
         raise damaged()
     yield held
+
+
+def chunks_of(recording_row: int) -> Select[bytes]:
+    """Return the query of the chunks of a recording, in their order."""
+    of = RecordingChunk
+    return select(of.data).where(of.recording == recording_row).order_by(of.number)
 
 
 def confined_reader(settings: Settings) -> ConfinedReader:

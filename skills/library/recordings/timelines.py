@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from skills.db import newest
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording
 from skills.db.session import Database
 from skills.errors import NotFound
@@ -58,10 +59,8 @@ def timeline_of(database: Database, source: Source, sha256: str, parse: Parser) 
     with database.reading() as session:
         plan = followed_plan(session, sha256)
         motion = planned(plan)
-        newest = select(StoredPlayback).where(StoredPlayback.plan_row == plan.row)
-        played = session.scalar(newest.order_by(StoredPlayback.row.desc()).limit(1))
-        measured = None if played is None else played.measured
-        passes = () if played is None else played.report.estimate.under[0].passes
+        played = session.scalar(newest(StoredPlayback, StoredPlayback.plan_row == plan.row))
+        measured, passes = (None, ()) if played is None else (played.measured, played.report.estimate.under[0].passes)
     odds = {number: one.succeeds.probability for number, one in enumerate(passes)}
     return timeline_of_plan(trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds)
 
@@ -87,7 +86,7 @@ class TimelineLink(NamedTuple):
 
 
 Row = StoredRecording | Demonstration | PolicyVersion | Plan
-FIND: dict[Source, Callable[[Session, str], Row]] = {
+FIND: dict[str, Callable[[Session, str], Row]] = {
     "recordings": find_recording,
     "demos": find_demo,
     "policy-versions": versions.find_by_digest,
@@ -102,10 +101,9 @@ def motion_named(session: Session, name: str) -> TimelineLink:
         NotFound: There is no such resource.
     """
     source, _, sha256 = name.partition("/")
-    for known, find in FIND.items():
-        if source == known:
-            return _link(find(session, sha256))
-    raise NotFound("There is no such motion to play beside this one; choose one of the list.")
+    if source not in FIND:
+        raise NotFound("There is no such motion to play beside this one; choose one of the list.")
+    return _link(FIND[source](session, sha256))
 
 
 def chosen(session: Session, source: Source, sha256: str) -> tuple[TimelineLink, Sequence[TimelineLink]]:
@@ -123,8 +121,8 @@ def chosen(session: Session, source: Source, sha256: str) -> tuple[TimelineLink,
         of = row.policy if isinstance(row, Plan) else row
         others += _newest(session, Demonstration, of.suture, of.surgeon_row)
         others += [one for one in _newest(session, PolicyVersion, of.suture, of.surgeon_row) if one.poses is not None]
-        plans = select(Plan).join(PolicyVersion).where(PolicyVersion.suture == of.suture).order_by(Plan.row.desc())
-        others += session.scalars(plans.limit(MOST_CHOICES))
+        plans = newest(Plan, PolicyVersion.suture == of.suture, limit=MOST_CHOICES).join(PolicyVersion)
+        others += session.scalars(plans)
     return _link(row), [_link(one) for one in others if one is not row]
 
 
@@ -143,6 +141,5 @@ def _link(row: Row) -> TimelineLink:
     if isinstance(row, Demonstration):
         return TimelineLink("demos", row.sha256, f"{row.surgeon.slug}, demonstration {row.sha256[:8]}")
     if isinstance(row, PolicyVersion):
-        name = f"{row.surgeon.slug}, learnt path of version {row.version}"
-        return TimelineLink("policy-versions", row.sha256, name)
+        return TimelineLink("policy-versions", row.sha256, f"{row.surgeon.slug}, learnt path of version {row.version}")
     return TimelineLink("plans", row.sha256, f"{row.policy.surgeon.slug}, plan {row.sha256[:8]}")
