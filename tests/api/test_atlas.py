@@ -10,8 +10,9 @@ import pytest
 from skills.api.pages import drawings
 from skills.comparison.distances import STATES
 from skills.comparison.recognition import NUMBERS
-from skills.library.comparison.atlas import _atlas, _compare
+from skills.library.comparison.atlas import _atlas, _Compared
 from skills.library.comparison.members import Member
+from skills.library.comparison.recognition import recognise_arms
 from skills.schemas.comparison import Atlas, LeftOutOfAtlas
 from tests import backends
 from tests.api.keyed import As, key
@@ -157,4 +158,5 @@ def drawn_from(far: np.ndarray) -> Atlas:
     ]
     shapes, signatures = np.zeros((len(far), STATES, 3)), np.random.default_rng(4).normal(size=(len(far), NUMBERS))
     left_out = LeftOutOfAtlas(without_consent=0, without_direction=[], overlapped=[], not_sampled=0, because=[])
-    return _atlas(cases.SUTURE, _compare(members, shapes, far, False, signatures, {}), left_out, 4, None)
+    compared, recognised = _Compared(members, shapes, far, False, {}), recognise_arms(members, signatures)
+    return _atlas(cases.SUTURE, compared, recognised, left_out, 4, None)

@@ -98,8 +98,7 @@ def atlas_of(
         shapes, far = np.array([distances.in_lengths(shape) for shape in apart.shapes_mm]), apart.apart_scaled
     else:
         shapes, far = apart.shapes_mm, apart.apart_mm
-    slugs, surgeon_of = np.unique([one.surgeon for one in members], return_inverse=True)
-    compared = _Compared(members, shapes, far / distances.STATES, scaled, slugs.tolist(), surgeon_of, found.shares)
+    compared = _Compared(members, shapes, far / distances.STATES, scaled, found.shares)
     return _atlas(suture, compared, recognise_arms(members, apart.signatures), left_out, clusters, found.asked)
 
 
@@ -174,15 +173,23 @@ def _count(demos: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """Members with the distances between all of them, and the surgeon of each as a number."""
+    """Members with the distances between all of them, and the surgeon and session of each as numbers."""
 
     members: Sequence[Member]
     shapes: Floats
     far: Floats
     scaled: bool
-    surgeons: list[str]
-    surgeon_of: Ints
     shares: Mapping[str, float]
+
+    @cached_property
+    def surgeons(self) -> list[str]:
+        """The surgeons, sorted."""
+        return sorted({one.surgeon for one in self.members})
+
+    @cached_property
+    def surgeon_of(self) -> Ints:
+        """The surgeon of each as a number."""
+        return np.searchsorted(self.surgeons, [one.surgeon for one in self.members])
 
     @cached_property
     def sessions(self) -> Ints:
