@@ -258,9 +258,6 @@ class PlanKeywords(TypedDict, total=False):
             "Height of level tissue, along z of the arm's frame: it is that of the scene. No motion is exported without tissue, of this, of the scene, or of the policy's."
         ),
     ]
-    realignment: Annotated[
-        bool, Doc("false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now; by default True.")
-    ]
     handoff: Annotated[
         Literal["none"] | None,
         Doc(

@@ -9,7 +9,6 @@ from skills.db.weighted_cache import WeightedCache
 from skills.library.operation.proofs import sign_files
 from skills.library.policies import answers
 from skills.library.policies.pose_styles import describe_pose_style, has_poses, poses_of
-from skills.library.policies.versions import Served
 from skills.settings import MEBIBYTE
 from skills.transparency.notes import Note
 
@@ -38,15 +37,15 @@ class Encoded:
         key = (policy.sha256, policy.version, policy.created_at, policy.poses.sha256 if policy.poses else None)
         return self._cached(key, lambda: _json_body(json_of(describe_pose_style(policy, poses_of(policy)))))
 
-    def signature(self, served: Served, head: Note, history: History) -> Body:
+    def signature(self, release: Release, head: Note, history: History) -> Body:
         """Return the signature of the responses of a released policy, each as it is sent; they are encoded for it.
 
         Args:
-            served: The policy and its release.
+            release: The release.
             head: A checkpoint of the history that covers both.
             history: The history, with the key.
         """
-        policy, release = served.policy, served.release
+        policy = release.policy
         bodies = {
             "policy.json": self.policy(policy, release, JSON),
             "policy-version.json": self.policy(policy, None, JSON),

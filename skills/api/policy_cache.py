@@ -139,10 +139,10 @@ class PolicyCache:
             known = self._known.get(key)
             if known is not None and release is not None and known.release == tuple(release) and not known.over:
                 return Known(known.body, known.release, known.last_day, None)
-            served = versions.policy_of(session, surgeon, suture)
+            served = versions.served_release(session, surgeon, suture)
             assert release is not None, "both look at the same state"
             if media_type == SIGNATURE:
-                rows = [("releases", served.release.row), ("policy_versions", served.policy.row)]
+                rows = [("releases", served.row), ("policy_versions", served.policy_row)]
                 head = first_head(session.connection(), self._database.history, rows)
                 if head is None:
                     return None
@@ -150,7 +150,7 @@ class PolicyCache:
             elif media_type == POSES:
                 body = self._encoded.pose_style(served.policy)
             else:
-                body = self._encoded.policy(served.policy, served.release, media_type)
+                body = self._encoded.policy(served.policy, served, media_type)
             return Known(body, tuple(release), consent.last_day(served.policy.surgeon.consent), None)
 
     async def _sweep(self) -> None:

@@ -47,7 +47,7 @@ from skills.learning.tube import CertifiedPoses
 from skills.library.people import consent
 from skills.library.policies import releases
 from skills.library.policies.pose_styles import describe_step, poses_of
-from skills.library.policies.versions import policy_of
+from skills.library.policies.versions import served_release
 from skills.schemas.pose_styles import PoseIn
 from skills.settings import Settings
 
@@ -326,8 +326,8 @@ def _credentials(scope: Scope) -> tuple[Any, ...]:
 
 def _pin(database: Database, surgeon: str, suture: str) -> Pinned:
     with database.reading() as session:
-        served = policy_of(session, surgeon, suture)
-        policy, release = served.policy, served.release
+        release = served_release(session, surgeon, suture)
+        policy = release.policy
         last_day = consent.last_day(policy.surgeon.consent)
         return Pinned(release.row, release.released_at, policy.version, policy.sha256, last_day, poses_of(policy))
 

@@ -30,7 +30,7 @@ NoHandoff = Annotated[
 ]
 
 
-@command(commands, without=("realignment", "starts_mm"))
+@command(commands, without=("starts_mm",))
 def plan(
     surgeon: Surgeon,
     suture: Suture,
@@ -64,7 +64,7 @@ def plan(
             goals = [mark for mark in client.suture_points(scene).points if mark.is_goal]
             points = [SuturePointIn(position_mm=one.position_mm, rotation_xyzw=one.turn_xyzw) for one in goals]
         made = client.plan(surgeon, suture, points, **options)
-    return table(made, ("id", "arm", "frame", "orientation", "trajectory.duration_s"), made.in_words)
+    return table(made, ("id", "arm", "frame", "orientation", "trajectory.duration_s"), made.description)
 
 
 def _set_hand_off(
@@ -112,7 +112,7 @@ def reach(
     _set_hand_off(options, obstacles, approach, base, handoff)
     with service() as client:
         found = client.reach(surgeon, suture, **options)
-    return text(found, *_drawn(found), found.in_words)
+    return text(found, *_drawn(found), found.description)
 
 
 MARKS = {"yes": "O", "no": ".", "in doubt": "?"}
@@ -148,7 +148,7 @@ def plans(plan_id: Annotated[str | None, typer.Argument(metavar="PLAN")] = None)
             return table(client.plans(), about)
         shown = client.plan_of(plan_id)
     columns = ("id", "surgeon", "suture", "policy.version", "trajectory.duration_s", "created_at")
-    return table(shown, columns, shown.in_words)
+    return table(shown, columns, shown.description)
 
 
 @command(commands)

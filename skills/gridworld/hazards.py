@@ -9,10 +9,8 @@ centre of its cell, and the size of the tool, belong into the scene's margin.
 A policy keeps the scene that it was learnt in, with its costs, as `Surroundings`.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass
 from math import isfinite
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +18,7 @@ from skills.arrays import Flags, Floats, Ints
 from skills.errors import BadSettings
 from skills.fields import schema
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
-from skills.gridworld.scene import Scene, plain_json
+from skills.gridworld.scene import Scene
 
 STAY = 13  # the action that stays: (0, 0, 0), the middle one of the moves
 
@@ -55,19 +53,6 @@ class Surroundings:
 
     scene: Scene
     costs: SceneCosts = SceneCosts()
-
-    def as_json(self) -> dict[str, Any]:
-        """Return both as plain JSON."""
-        return {"scene": self.scene.as_json(), "costs": plain_json(asdict(self.costs))}
-
-    @classmethod
-    def of_json(cls, described: Mapping[str, Any]) -> "Surroundings":
-        """Return both from their JSON.
-
-        Raises:
-            BadSettings: As for `Scene.of_json`; or a cost is out of range.
-        """
-        return cls(Scene.of_json(described["scene"]), SceneCosts(**described["costs"]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,33 +66,36 @@ def workflow_id(row: int, attempt: int) -> str:
 
 def configuration(settings: Settings, executor: str) -> "DBOSConfig":
     """Return the engine's configuration for one worker process."""
-    from dbos import DBOSPortableJSONSerializer
-
-    return {
+    found: DBOSConfig = _system(settings) | {
         "name": APPLICATION,
-        "system_database_url": _address(settings),
-        "dbos_system_schema": "dbos",
-        "serializer": DBOSPortableJSONSerializer(),  # the default is pickle, which can execute stored bytes
         "executor_id": executor,
         "application_version": STEPS,
         "log_level": "WARNING",
         "use_listen_notify": False,  # queues are polled anyway, and we send no messages
     }
+    return found
 
 
 def connect(settings: Settings) -> "DBOSClient":
     """Return a client of the engine; it connects on first use."""
-    from dbos import DBOSClient, DBOSPortableJSONSerializer
+    from dbos import DBOSClient
 
     prepare(settings)
-    return DBOSClient(
-        system_database_url=_address(settings),
-        dbos_system_schema="dbos",
-        serializer=DBOSPortableJSONSerializer(),
-        application_name=APPLICATION,
-        lazy=True,
-        retry_connection_errors=False,
-    )
+    return DBOSClient(**_system(settings), application_name=APPLICATION, lazy=True, retry_connection_errors=False)
+
+
+def _system(settings: Settings) -> Any:
+    """Return the settings of the engine's database, with `Clock` if it is a SQLite file."""
+    from dbos import DBOSPortableJSONSerializer
+
+    url = make_url(settings.engine_url)
+    if url.get_backend_name() == "sqlite":
+        url = url.update_query_pairs([("plugin", CLOCK)])
+    return {
+        "system_database_url": url.render_as_string(hide_password=False),
+        "dbos_system_schema": "dbos",
+        "serializer": DBOSPortableJSONSerializer(),  # the default is pickle, which can execute stored bytes
+    }
 
 
 def prepare(settings: Settings) -> None:
@@ -137,14 +140,6 @@ def _now_s(modifier: str) -> float:
     if modifier != "subsec":
         raise ValueError(modifier)  # nothing else of the function that this one replaces is used
     return round(time(), 3)
-
-
-def _address(settings: Settings) -> str:
-    """Return the URL of the engine's database, with `Clock` if it is a SQLite file."""
-    url = make_url(settings.engine_url)
-    if url.get_backend_name() == "sqlite":
-        url = url.update_query_pairs([("plugin", CLOCK)])
-    return url.render_as_string(hide_password=False)
 
 
 def queue_of(kind: str) -> str:

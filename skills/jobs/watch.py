@@ -94,52 +94,44 @@ ENDINGS = {
 ENGINE_FAILED = ("ERROR", "SUCCESS")
 
 
+@dataclass
 class Watch:
-    """The periodic rounds of one worker."""
+    """The periodic rounds of one worker.
 
-    def __init__(
-        self,
-        database: Database,
-        client: DBOSClient,
-        executor: str,
-        leases: Leases,
-        recover: Callable[[list[str]], object],
-        doing: Collection[str] = frozenset(),
-        sweep: Callable[[], bool] = lambda: True,
-    ) -> None:
-        """Create the watch of one executor.
+    Attributes:
+        database: Our database.
+        client: Client of the engine.
+        executor: Id of this worker in the engine and in our table of executors.
+        leases: Leases of the other workers.
+        recover: Callback that returns the pending workflows of dead executors to their queue, provided that they are
+            still pending and still assigned to those executors.
+        doing: Ids of the workflows that this worker is running; a live view, not a copy.
+        sweep: Deletes what nobody needs any more in our database for a moment; returns whether nothing is left.
+    """
 
-        Args:
-            database: Our database.
-            client: Client of the engine.
-            executor: Id of this worker in the engine and in our table of executors.
-            leases: Leases of the other workers.
-            recover: Callback that returns the pending workflows of dead executors to their queue, provided that they
-                are still pending and still assigned to those executors.
-            doing: Ids of the workflows that this worker is running; a live view, not a copy.
-            sweep: Deletes what nobody needs any more in our database for a moment; returns whether nothing is left.
-        """
-        self._database = database
-        self._client = client
-        self._executor = executor
-        self._leases = leases
-        self._recover = recover
-        self._doing = doing
-        self._sweep = sweep
-        self._swept_s: float | None = None
-        self._unheard = Leases(leases.lease_s, leases.clock)
+    database: Database
+    client: DBOSClient
+    executor: str
+    leases: Leases
+    recover: Callable[[list[str]], object]
+    doing: Collection[str] = frozenset()
+    sweep: Callable[[], bool] = lambda: True
+    _swept_s: float | None = None
+
+    def __post_init__(self) -> None:
+        self._unheard = Leases(self.leases.lease_s, self.leases.clock)
 
     def beat(self) -> None:
         """Write a heartbeat."""
-        with self._database.writing(()) as session:
-            mine = update(Executor).where(Executor.id == self._executor).values(beat_at=now()).returning(Executor.id)
+        with self.database.writing(()) as session:
+            mine = update(Executor).where(Executor.id == self.executor).values(beat_at=now()).returning(Executor.id)
             if session.execute(mine).first() is None:  # the first heartbeat, or others have deleted our row
-                session.add(Executor(id=self._executor))
+                session.add(Executor(id=self.executor))
 
     def round(self) -> None:
         """Write a heartbeat, sign the history, take over from dead workers, enqueue new jobs, read back outcomes."""
         self.beat()
-        if not sign_some_history(self._database):
+        if not sign_some_history(self.database):
             return  # of another database than was signed last nothing is done
         self._take_over()
         live = self._live()
@@ -148,41 +140,41 @@ class Watch:
         for job, name in zip(live, names, strict=True):
             workflow = known.get(name)
             if workflow is None:
-                submit(self._client, job.row, job.attempt, job.kind)
+                submit(self.client, job.row, job.attempt, job.kind)
             elif workflow.status in ENDINGS:
                 state, reason = ENDINGS[workflow.status]
-                fail(self._database, job.row, job.attempt, reason, state)
+                fail(self.database, job.row, job.attempt, reason, state)
             elif workflow.status in ENGINE_FAILED:
                 self._begin_again(job.row, job.attempt)
         self._note_submitted([job.row for job in live if job.submitted_at is None])
         if self._swept_s is None or time.monotonic() - self._swept_s > SWEEP_S:
             self._forget_ended()
-            if self._sweep():
+            if self.sweep():
                 self._swept_s = time.monotonic()
 
     def verify(self) -> None:
         """Verify the history and all logged rows, if this is the first of the workers; log and count the faults."""
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             first = session.scalar(select(func.min(Executor.id)))
-        if first != self._executor or self._database.history.refused is not None:
+        if first != self.executor or self.database.history.refused is not None:
             return
-        with self._database.reading() as session:
-            found = list(verify_history(session.connection(), self._database.history, None, Verified()))
+        with self.database.reading() as session:
+            found = list(verify_history(session.connection(), self.database.history, None, Verified()))
         for name, why in found[:NAMED]:
             log.error("The history is not whole: %s: %s; run `skills verify`.", name, why)
-        with self._database.writing(()) as session:
-            mine = update(Executor).where(Executor.id == self._executor)
+        with self.database.writing(()) as session:
+            mine = update(Executor).where(Executor.id == self.executor)
             session.execute(mine.values(verified_at=now(), faults_found=len(found)))
 
     def leave(self) -> None:
         """Sign the last leaves of the history, and remove this worker from the table of executors."""
-        sign_some_history(self._database, inf)
-        with self._database.writing(()) as session:
-            session.execute(delete(Executor).where(Executor.id == self._executor))
+        sign_some_history(self.database, inf)
+        with self.database.writing(()) as session:
+            session.execute(delete(Executor).where(Executor.id == self.executor))
 
     def at_work(self, *queues: str) -> bool:
         """Return whether this worker still holds workflows of some queues, by default of any."""
-        return bool(self._pending(self._executor, queues or QUEUES))
+        return bool(self._pending(self.executor, queues or QUEUES))
 
     def _take_over(self) -> None:
         """Return the workflows of dead workers to their queues, and forget workers that have been silent for long.
@@ -191,17 +183,17 @@ class Watch:
         has just taken over, and would reset the count of workers that the work has killed.
         """
         pending = self._pending()
-        self._give_back({workflow.workflow_id for workflow in pending if workflow.executor_id == self._executor})
+        self._give_back({workflow.workflow_id for workflow in pending if workflow.executor_id == self.executor})
         holders = {workflow.executor_id for workflow in pending if workflow.executor_id}
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             beats = {row.id: row.beat_at for row in session.execute(select(Executor.id, Executor.beat_at))}
         others = {**dict.fromkeys(holders), **beats}
-        others.pop(self._executor, None)
-        silent_s = self._leases.look(others)
-        if dead := sorted(self._leases.dead()):
+        others.pop(self.executor, None)
+        silent_s = self.leases.look(others)
+        if dead := sorted(self.leases.dead()):
             self._inherit(dead)
         for executor in others.keys() - holders:
-            if silent_s[executor] > FORGOTTEN_AFTER_LEASES * self._leases.lease_s:
+            if silent_s[executor] > FORGOTTEN_AFTER_LEASES * self.leases.lease_s:
                 self._forget(executor, beats[executor])
 
     def _forget_ended(self) -> None:
@@ -209,7 +201,7 @@ class Watch:
         before = (now() - timedelta(days=ENGINE_DAYS)).isoformat()
         ended = self._workflows(status=["SUCCESS", *ENDINGS, "ERROR"], end_time=before, limit=AT_ONCE)
         if ended:
-            self._client.delete_workflows([one.workflow_id for one in ended])
+            self.client.delete_workflows([one.workflow_id for one in ended])
 
     def _give_back(self, mine: set[str]) -> None:
         """Return workflows to the queue that are assigned to this worker but have not been started for a full lease.
@@ -217,10 +209,10 @@ class Watch:
         That happens when the connection breaks between a commit and its response: the worker never learns of the
         assignment.
         """
-        self._unheard.look(dict.fromkeys(mine.difference(self._doing)))
+        self._unheard.look(dict.fromkeys(mine.difference(self.doing)))
         for workflow in self._unheard.dead():
             log.warning("Job %s was claimed and never started; it is queued again.", workflow)
-            self._client._sys_db.reenqueue_for_recovery(workflow, [self._executor], JOBS)
+            self.client._sys_db.reenqueue_for_recovery(workflow, [self.executor], JOBS)
 
     def _inherit(self, dead: list[str]) -> None:
         """Return the workflows of dead workers to their queues.
@@ -235,10 +227,10 @@ class Watch:
         ours = {w.executor_id for w in left if w.app_version == STEPS and w.status == "PENDING" and w.executor_id}
         if ours:
             log.warning("Taking over from %s, silent for longer than its lease.", ", ".join(sorted(ours)))
-            self._recover(sorted(ours))
+            self.recover(sorted(ours))
 
     def _forget(self, executor: str, beat_at: object) -> None:
-        with self._database.writing(()) as session:
+        with self.database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == executor, Executor.beat_at == beat_at))
 
     def _live(self) -> Sequence[Any]:
@@ -248,12 +240,12 @@ class Watch:
         """
         query = select(Job.row, Job.attempt, Job.submitted_at, Job.kind)
         query = query.where(Job.state.in_(ACTIVE), Job.kind != BATCH)
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             return session.execute(query.order_by(Job.submitted_at.is_not(None), Job.row).limit(AT_ONCE)).all()
 
     def _workflows(self, **chosen: Any) -> list[WorkflowStatus]:
         """Return some workflows of the engine, without their inputs and outputs, which are not needed here."""
-        return self._client.list_workflows(**chosen, load_input=False, load_output=False)
+        return self.client.list_workflows(**chosen, load_input=False, load_output=False)
 
     def _pending(self, executor: str | None = None, queues: Iterable[str] = QUEUES) -> list[WorkflowStatus]:
         return self._workflows(status="PENDING", queue_name=list(queues), executor_id=executor)
@@ -266,10 +258,10 @@ class Watch:
         """
         row, attempt = map(int, workflow.split("-"))
         again = {"state": "queued", "attempt": attempt + 1, "submitted_at": None}
-        with self._database.writing([locks.job(row)]) as session:
+        with self.database.writing([locks.job(row)]) as session:
             mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
             session.execute(update(Job).where(*mine).values(**again))
-        cancel(self._client, row, attempt)
+        cancel(self.client, row, attempt)
 
     def _begin_again(self, row: int, attempt: int) -> None:
         """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`."""
@@ -280,13 +272,13 @@ class Watch:
             reason = (
                 f"The job engine failed {attempt} times in this job; check the worker's log, then request it again."
             )
-            fail(self._database, row, attempt, reason)
+            fail(self.database, row, attempt, reason)
 
     def _note_submitted(self, rows: Sequence[int]) -> None:
         if rows:
             # Rows that another transaction changes now are left for the next round: waiting for several rows in an
             # order of its own could deadlock.
             new = select(Job.row).where(Job.row.in_(rows), Job.submitted_at.is_(None))
-            with self._database.writing(()) as session:
+            with self.database.writing(()) as session:
                 mine = Job.row.in_(new.with_for_update(skip_locked=True))
                 session.execute(update(Job).where(mine).values(submitted_at=now()), **UNSYNCHRONISED)

@@ -19,7 +19,6 @@ import uuid
 from collections.abc import Callable
 from itertools import cycle
 from threading import Event, Thread
-from types import FrameType
 
 from sqlalchemy import select
 
@@ -61,11 +60,17 @@ def logged(perform: Perform) -> Perform:
     """
 
     def run(database: Database, row: int, attempt: int, settings: Settings) -> None:
-        name, kind, _ = _look(database, row)
+        about = select(Job.id, Job.kind, Job.state).where(Job.row == row)
+
+        def look() -> tuple[str, str, str]:
+            with database.reading() as session:
+                return session.execute(about).tuples().first() or ("", "", "erased")
+
+        name, kind, _ = look()
         token, began, outcome = job_id.set(name), time.monotonic(), ""
         try:
             perform(database, row, attempt, settings)
-            outcome = _look(database, row)[2]
+            outcome = look()[2]
         except Exception as error:
             outcome = type(error).__name__
             raise
@@ -75,12 +80,6 @@ def logged(perform: Perform) -> Perform:
             job_id.reset(token)
 
     return run
-
-
-def _look(database: Database, row: int) -> tuple[str, str, str]:
-    with database.reading() as session:
-        found = session.execute(select(Job.id, Job.kind, Job.state).where(Job.row == row)).first()
-    return ("", "", "erased") if found is None else (found.id, found.kind, found.state)
 
 
 ROUND_S = 0.5
@@ -110,7 +109,9 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
     if settings.containment == "required":
         refuse_uncontained()
     keep_freed_memory()
-    stop = _stopped_by_signals()
+    stop = Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
     perform = logged(perform or _library())
     executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # unique: with a reused id the engine would run its work twice
     database = Database.of(settings)
@@ -127,10 +128,16 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
     try:
         watch.beat()  # registered before it can hold any job, so that others can take over
         Thread(target=_keep_verified, args=(watch, settings.verify_every_s), daemon=True, name="verify").start()
-        with engine_of(work, executor, lambda: _patience_s(watch), lambda: _survive(watch.beat)):
+        # Those of `LOW_PRIORITY` may take long, no user waits for them, and they are run again.
+        with engine_of(
+            work,
+            executor,
+            patience_s=lambda: DRAIN_S if _at_work(watch, JOBS, BATCHES) else 0,
+            beat=lambda: _survive(watch.beat),
+        ):
             gc.freeze()  # everything imported so far stays, so later collections skip it
             gc.enable()  # the callers disable it while they import
-            _go_round(watch, lambda: stop.wait(ROUND_S) or _orphaned(parent))
+            _go_round(watch, lambda: stop.wait(ROUND_S) or parent not in (None, os.getppid()))
         _go_if_cut_short(watch)
         _survive(watch.leave)
     finally:
@@ -180,15 +187,6 @@ def _library() -> Perform:
     return perform_job
 
 
-def _patience_s(watch: Watch) -> int:
-    """Return the timeout of draining in seconds.
-
-    It is 0 unless jobs of the queues `JOBS` or `BATCHES` run: those of `LOW_PRIORITY` may take long, no user waits for
-    them, and they are run again.
-    """
-    return DRAIN_S if _at_work(watch, JOBS, BATCHES) else 0
-
-
 def _at_work(watch: Watch, *queues: str) -> bool:
     """Return whether this worker holds jobs of some queues.
 
@@ -211,21 +209,6 @@ def _survive(step: Callable[[], None]) -> bool:
     except Exception:
         log.warning("The watch missed a round; the next one does its work.", exc_info=True)
         return False
-
-
-def _stopped_by_signals() -> Event:
-    stop = Event()
-
-    def ask(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGTERM, ask)
-    signal.signal(signal.SIGINT, ask)
-    return stop
-
-
-def _orphaned(parent: int | None) -> bool:
-    return parent is not None and os.getppid() != parent
 
 
 def _go_if_cut_short(watch: Watch) -> None:

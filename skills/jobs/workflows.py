@@ -39,15 +39,6 @@ class Work:
     perform: Perform
     doing: set[str] = field(default_factory=set)  # ids of the workflows that are running in this process
 
-    @contextmanager
-    def begun(self, workflow: str) -> Iterator[None]:
-        """Register a workflow as running for the duration of the block."""
-        self.doing.add(workflow)
-        try:
-            yield
-        finally:
-            self.doing.discard(workflow)
-
     def try_once(self, row: int, attempt: int, tries: int) -> bool:
         """Try to perform a job and return whether it is settled, by success or by a permanent failure.
 
@@ -133,12 +124,12 @@ def register(work: Work) -> None:
     # A job that kills its worker is recovered as many times as one that raises is retried.
     @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=attempts - 1)
     def perform_job(row: int, attempt: int) -> None:
-        with work.begun(workflow_id(row, attempt)):
+        work.doing.add(name := workflow_id(row, attempt))
+        try:
             if not any(try_job(row, attempt, tries) for tries in range(attempts)):
                 give_up(row, attempt)
-
-
-log = logging.getLogger(__name__)
+        finally:
+            work.doing.discard(name)
 
 
 def recover_workflows(executors: list[str]) -> None:

@@ -13,25 +13,27 @@ from typing import Any
 from skills.db import now
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
-from skills.library.operation.jobs import PART, Store, names_of, while_running
-from skills.library.plans.playback_pictures import draw_pictures
-from skills.library.plans.playbacks import check_playback
-from skills.library.plans.tries import TRY, perform_try
+from skills.library.operation.jobs import JobRequest, PartRequest, Store, names_of, while_running
+from skills.library.plans.playback_pictures import PicturesRequest, draw_pictures
+from skills.library.plans.playbacks import PlaybackRequest, check_playback
+from skills.library.plans.tries import TryRequest, perform_try
 from skills.library.policies.batches import retrain_part
+from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.training import train_style
-from skills.library.recordings.datasets import export_dataset
+from skills.library.recordings.datasets import DatasetRequest, export_dataset
 from skills.settings import Settings
 
 __all__ = ["perform_job"]
 
-MAKERS: dict[str, Callable[[Database, Any, Settings], Store]] = {
-    "training": train_style,
-    PART: retrain_part,
-    "playback": check_playback,
-    "pictures": draw_pictures,
-    "dataset": export_dataset,
-    TRY: perform_try,
+PERFORMERS: dict[type[JobRequest], Callable[[Database, Any, Settings], Store[Any]]] = {
+    TrainingRequest: train_style,
+    PartRequest: retrain_part,
+    PlaybackRequest: check_playback,
+    PicturesRequest: draw_pictures,
+    DatasetRequest: export_dataset,
+    TryRequest: perform_try,
 }
+REQUESTS = {request.kind: request for request in PERFORMERS}
 
 
 def perform_job(database: Database, row: int, attempt: int, settings: Settings) -> None:
@@ -52,12 +54,12 @@ def perform_job(database: Database, row: int, attempt: int, settings: Settings) 
         job = session.get(Job, row)
         if job is None or job.state != "running" or job.attempt != attempt:
             return  # erased, cancelled, or taken by another attempt
-        kind, request, names = job.kind, job.request, names_of(session, row)
+        request, names = REQUESTS[job.kind].model_validate(job.request), names_of(session, row)
     running = while_running(database, row, attempt)
-    store = MAKERS[kind](running, request, settings)
+    store = PERFORMERS[type(request)](running, request, settings)
     with running.writing(names) as session:  # the first finished attempt is the only one that stores a result
         job = session.get_one(Job, row)
         job.state, job.progress, job.ended_at = "succeeded", 1.0, now()
         session.flush()
-        job.result = store(session, job.requested_by)
-        record_event(session, "worker", "finish", f"job-{kind}", job.id)
+        job.result = store(session, job.requested_by).model_dump(mode="json")
+        record_event(session, "worker", "finish", f"job-{job.kind}", job.id)

@@ -14,7 +14,7 @@ Lengths are mm; the frame of a position is in a field of its own.
 
 from dataclasses import dataclass
 from reprlib import Repr
-from typing import Annotated, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Field
 
@@ -39,6 +39,17 @@ class Given(Documented):
         extra="ignore", frozen=True, defer_build=True, from_attributes=True, validate_by_name=True,
         validate_by_alias=True, serialize_by_alias=True,
     )  # fmt: skip
+
+    @classmethod
+    def from_attributes_of(cls, source: object, **more: Any) -> Self:
+        """Return an answer with the attributes of a row or value that have the names of its fields, except for `more`.
+
+        Args:
+            source: It has an attribute of every field that is not in `more`.
+            more: The other fields.
+        """
+        names = cls.model_fields.keys() - more.keys()
+        return cls.model_validate({name: getattr(source, name) for name in names} | more)
 
     def __repr_str__(self, join_str: str) -> str:
         """Return the fields in a few lines: a policy has tens of thousands of actions, which would flood a notebook."""

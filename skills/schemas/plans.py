@@ -7,7 +7,7 @@ the plan. A figure is null if it could not be measured; a gate with such a figur
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictBool, StrictInt
+from pydantic import Field, StrictInt
 
 from skills.fields import Count, Point, Quaternion, Sha256, Slug
 from skills.gridworld.scene import Scene
@@ -81,7 +81,6 @@ class PlanIn(Schema):
             is the scene that the policy was learnt in.
         tissue_mm: Height of level tissue, along z of the arm's frame: it is that of the scene. No motion is exported
             without tissue, of this, of the scene, or of the policy's.
-        realignment: false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now.
         handoff: none asks for a plan that hands nothing over: A1 alone. Without it a plan is refused for which neither
             psm_m nor the demonstration says where PSM_M is.
     """
@@ -125,7 +124,6 @@ class PlanIn(Schema):
     psm_m: PsmMIn | None = None
     scene: SceneIn | None = None
     tissue_mm: Coordinate | None = None
-    realignment: StrictBool = True
     handoff: Literal["none"] | None = None
 
 
@@ -230,7 +228,6 @@ class PlanDescription(Given):
     a2: str | None
     path: str
     psm_m: PsmM | None
-    realignment: bool
     scene: PlanScene | None
     speed_mm_s: float
     tip_offset_mm: float
@@ -248,7 +245,7 @@ class Plan(PlanDescription):
 
     Attributes:
         hands_over: Whether a hand-off is planned: A2 towards PSM_M.
-        in_words: What the plan does and what it leaves out.
+        description: What the plan does and what it leaves out.
     """
 
     id: Sha256
@@ -257,7 +254,7 @@ class Plan(PlanDescription):
     suture: Slug
     policy: PolicyName
     hands_over: bool
-    in_words: str
+    description: str
     created_at: datetime
 
 

@@ -85,4 +85,4 @@ class Reach(Given):
     counts: tuple[Count, Count, Count]
     rotations: Count
     places: list[ReachPlace]
-    in_words: str
+    description: str

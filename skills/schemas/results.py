@@ -1,6 +1,7 @@
 """Results of jobs by kind, and the values of refusals, as a client reads them.
 
-`Job.result` is plain JSON, because its form depends on the kind of the job; each class here is that of one kind.
+`Job.result` is plain JSON, because its form depends on the kind of the job; each class here is that of one kind. That
+of a training is in `training`.
 """
 
 from collections.abc import Mapping
@@ -14,6 +15,13 @@ from skills.schemas.tries import TryStep
 
 class PlaybackResult(JobResult):
     """The playback of a plan."""
+
+    playback: Sha256
+    feasible: bool
+
+
+class PicturesResult(JobResult):
+    """The pictures of a playback."""
 
     playback: Sha256
 

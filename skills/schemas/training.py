@@ -83,11 +83,6 @@ class TrainingIn(Schema):
         costs = SceneCosts() if self.scene_costs is None else SceneCosts(**self.scene_costs.model_dump())
         return Surroundings(self.scene.value, costs)
 
-    @property
-    def combining(self) -> Combining | None:
-        """The way of combining as a value of the domain."""
-        return None if self.combine is None else self.combine.kind
-
 
 class RetrainingIn(Schema):
     """A batch of trainings. Defaults: all styles, the phase learner, no release.

@@ -5,9 +5,9 @@ request again with them applies it. A client needs to know no more: a page makes
 command.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, StrictBool
+from pydantic import Field, JsonValue, StrictBool
 
 from skills.gridworld.grid import MAX_HYSTERESIS
 from skills.schemas import Given
@@ -69,7 +69,7 @@ class Choice(Given):
     """An answer or a remedy: the words, and the fields of the request that apply it."""
 
     words: str
-    change: dict[str, Any]
+    change: dict[str, JsonValue]
 
 
 StepName = Literal[

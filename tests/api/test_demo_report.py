@@ -218,9 +218,9 @@ def test_a_plan_takes_psm_ms_approach_from_the_demonstration_and_says_so(here: S
     seen = f"the demonstration: PSM1 at {partner['at_s']:g} s of its recording"
     assert made["psm_m"]["from"] == {"approach": seen, "base": None}
     assert (made["psm_m"]["base_mm"], made["trajectory"]["psm_m_moves"]) == (None, False)
-    assert (made["realignment"], made["a2"]) == (True, "recorded")
+    assert (made["hands_over"], made["a2"]) == (True, "recorded")
     made = plan(here, a2="paper")
-    assert (made["realignment"], made["a2"]) == (True, "paper")
+    assert (made["hands_over"], made["a2"]) == (True, "paper")
     x, y, z, w = made["passes"][0]["target_xyzw"]
     normal = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
     assert abs(normal @ [-1, 0, 0]) == pytest.approx(1.0), "PSM_A's normal is parallel to PSM_M's approach"
@@ -248,8 +248,8 @@ def test_psm_ms_base_is_the_demonstrated_one_if_both_bases_were_recorded(here: S
 
 
 def test_a1_alone_is_planned_where_that_is_asked_for(here: Service, two_arms: dict):
-    made = plan(here, realignment=False)
-    assert (made["psm_m"], made["realignment"], made["passes"][0]["target_xyzw"]) == (None, False, None)
+    made = plan(here, handoff="none")
+    assert (made["psm_m"], made["hands_over"], made["passes"][0]["target_xyzw"]) == (None, False, None)
 
 
 def test_the_page_shows_the_other_arm(here: Service, two_arms: dict):

@@ -110,13 +110,13 @@ def test_a_plan_that_hands_nothing_over_is_made_on_request_alone(still: Service)
     made = still.http.post("/plans", json=body | {"handoff": "none"})
     assert made.status_code == 201
     alone = made.json()
-    assert (alone["hands_over"], alone["psm_m"], alone["realignment"]) == (False, None, False)
-    assert "along 1 pass; no hand-off: no PSM_M, no A2." in alone["in_words"]
+    assert (alone["hands_over"], alone["psm_m"]) == (False, None)
+    assert "along 1 pass; no hand-off: no PSM_M, no A2." in alone["description"]
     assert alone["a2"] is None
     assert 0 < alone["trajectory"]["tempo"] <= 1
     whole = plan(still, [3.0, 55.0, -125.0], psm_m={"approach": APPROACH, "base": BASE})
     assert whole["hands_over"]
-    assert "hands the needle to PSM_M" in whole["in_words"]
+    assert "hands the needle to PSM_M" in whole["description"]
 
 
 @pytest.mark.parametrize("arms", [[UNCALIBRATED], pytest.param([ARMS, UNCALIBRATED], marks=pytest.mark.nightly)])

@@ -28,7 +28,7 @@ def test_places_are_where_plans_are_made(still: Service):
         point = {name: one[name] for name in ("position_mm", "rotation_xyzw")}
         answer = still.http.post("/plans", json=KESTREL | asked | {"suture_points": [point]})
         assert answer.status_code == status, (one, answer.text)
-    assert f"{sum(one['reach'] == 'yes' for one in places)} of 70 places can be planned" in found["in_words"]
+    assert f"{sum(one['reach'] == 'yes' for one in places)} of 70 places can be planned" in found["description"]
 
 
 def test_a_map_is_bounded(still: Service):

@@ -144,7 +144,7 @@ def test_a_plan_takes_the_scene_of_its_policy_and_its_tool_touches(trained: Serv
     made = planned(trained)
     assert made["scene"]["sha256"] == made["scene"]["learnt_sha256"] == about["scene"]["sha256"]
     assert (made["scene"]["scene"], made["scene"]["differs"]) == (SCENE.as_json(), [])
-    assert "It is checked against the scene of its policy" in made["in_words"]
+    assert "It is checked against the scene of its policy" in made["description"]
     playback = verdict_of(trained, made)
     assert not playback["feasible"]
     assert playback["report"]["failure"]["quantity"] == "clearance of the scene"
@@ -164,7 +164,7 @@ def test_a_plan_may_state_another_scene_and_says_how_it_differs(trained: Service
     made = planned(trained, scene=FREE.as_json())
     assert made["scene"]["sha256"] != made["scene"]["learnt_sha256"]
     assert made["scene"]["differs"] == ["box 0 of the learnt scene is not in this one", "the tissue is another one"]
-    assert "not the one that its policy was learnt in: box 0 of the learnt scene" in made["in_words"]
+    assert "not the one that its policy was learnt in: box 0 of the learnt scene" in made["description"]
     assert made["id"] != planned(trained)["id"]
     stranger = trained.http.post(
         "/plans",
@@ -191,10 +191,10 @@ def test_a_plan_far_from_its_scene_is_feasible_and_states_the_distance(trained: 
 def test_a_plan_without_a_scene_says_that_no_tissue_is_checked(trained: Service):
     made = planned(trained)
     assert made["scene"] is None
-    assert "Tissue: not given, so nothing is checked against it" in made["in_words"]
+    assert "Tissue: not given, so nothing is checked against it" in made["description"]
     stated = planned(trained, scene=FREE.as_json())
     assert (stated["scene"]["learnt_sha256"], stated["scene"]["differs"]) == (None, [])
-    assert "of which its policy knows nothing" in stated["in_words"]
+    assert "of which its policy knows nothing" in stated["description"]
 
 
 def test_the_differences_of_scenes_are_named():

@@ -31,13 +31,14 @@ from skills.errors import BadPath
 from skills.gridworld.grid import PAPER_GRID, discretize
 from skills.gridworld.reward import RewardMap
 from skills.jobs import Engine
-from skills.learning.certificate import Certificate, Coverage, certify
-from skills.learning.policy import LEARNER_VERSION, describe_learner, learn_tabular
+from skills.learning.certificate import Certificate, Coverage, NearLimits, certify
+from skills.learning.policy import describe_learner, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation.jobs import PART, attempts_to_submit
 from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies.learning import Lesson, learn_style, lessons
+from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.retraining import request_retraining
 from skills.library.recordings.demos import upload_demo
 from skills.schemas.demos import DemoIn
@@ -175,16 +176,14 @@ def worked_out(lesson: Lesson) -> None:
     learn_style(lesson, training_of(lesson), LIMITS)
 
 
-def training_of(lesson: Lesson) -> dict[str, object]:
-    return {
-        "surgeon": lesson.surgeon.slug,
-        "suture": lesson.suture,
-        "demos": [lesson.sha256],
-        "learner": describe_learner(PhaseQLearning()),
-        "learner_version": LEARNER_VERSION,
-        "seed": 0,
-        "release": False,
-    }
+def training_of(lesson: Lesson) -> TrainingRequest:
+    return TrainingRequest(
+        surgeon=lesson.surgeon.slug,
+        suture=lesson.suture,
+        demos=[lesson.sha256],
+        learner=PhaseQLearning(),
+        near=NearLimits(),
+    )
 
 
 # ---- ours

@@ -141,8 +141,8 @@ def newest(session: Session, style: Style) -> Demonstration | None:
 
 
 def encoded(session: Session, style: Style, media_type: str) -> object:
-    served = versions.policy_of(session, *style)
-    return Encoded().policy(served.policy, served.release, media_type)
+    served = versions.served_release(session, *style)
+    return Encoded().policy(served.policy, served, media_type)
 
 
 def last_batch(session: Session) -> Job:

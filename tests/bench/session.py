@@ -22,7 +22,7 @@ from skills.db.session import Database
 from skills.learning.pose_step import next_pose
 from skills.library.policies import releases
 from skills.library.policies.pose_styles import poses_of
-from skills.library.policies.versions import policy_of
+from skills.library.policies.versions import served_release
 from skills.serving import environment
 from skills.settings import Settings
 from tests import backends
@@ -59,7 +59,7 @@ def session(table: Table, clients: int = CLIENTS, seconds: float = SECONDS) -> N
 def in_process(table: Table, database: Database) -> None:
     """Measure `next_pose`."""
     with database.reading() as opened:
-        poses = poses_of(policy_of(opened, **KESTREL).policy)
+        poses = poses_of(served_release(opened, **KESTREL).policy)
     path, limits, took = poses.path, poses.tube.limits, []
     for call in range(CALLS):
         phase = call % 100
@@ -90,7 +90,7 @@ def over_loopback(table: Table, database: Database, clients: int, seconds: float
         )
         sleep(0.5)
         with database.writing() as opened:
-            policy = policy_of(opened, **KESTREL).policy
+            policy = served_release(opened, **KESTREL).policy
             releases.withdraw(opened, policy.surgeon, policy.suture, "bench")
         withdrawn = monotonic()
         ends = json.loads(crowd.stdout.readline())

@@ -17,7 +17,8 @@ from skills.library.operation.installation import count_jobs
 from skills.library.operation.overview import newest_job
 from skills.library.operation.styles import matrix, released_styles
 from skills.library.people import surgeons, suture_types
-from skills.library.policies import answers, batches, learning, retraining, training, versions
+from skills.library.plans.playback_pictures import PicturesRequest
+from skills.library.policies import answers, learning, releases, retraining, training, versions
 from skills.library.recordings import demos, proposals
 from skills.schemas.training import RetrainingIn, TrainingIn
 from tests import backends
@@ -49,7 +50,7 @@ def newest(session: Session) -> Any:
 
 
 def served(session: Session) -> Any:
-    found = versions.policy_of(session, *STYLE)
+    found = versions.served_release(session, *STYLE)
     return found.policy.learnt, found.policy.covered, found.policy.demonstration
 
 
@@ -76,19 +77,19 @@ HOT: dict[str, Callable[[Session], object]] = {
     "a released policy": served,
     "a style's versions": lambda s: versions.list_versions(s, *STYLE, 10, 5),
     "a version": lambda s: versions.find_version(s, *STYLE, 1),
-    "a version by its digest": lambda s: versions.find_by_digest(s, versions.policy_of(s, *STYLE).policy.sha256),
+    "a version by its digest": lambda s: versions.find_by_digest(s, versions.served_release(s, *STYLE).policy.sha256),
     "a training": lambda s: training.request_training(s, TrainingIn(surgeon=STYLE[0], suture=STYLE[1]), "test"),
     "a surgeon's stale styles": lambda s: retraining.choose_styles(s, RetrainingIn(surgeon=STYLE[0], only_stale=True)),
-    "where what was learnt stands": lambda s: s.execute(learning.DEMO_STATES, {"demonstrations": [1, 2, 3]}).all(),
-    "what is known already": lambda s: s.execute(learning.KNOWN, {"digests": ["0" * 64, "1" * 64]}).all(),
-    "what some styles serve": lambda s: s.execute(batches.SERVED, {"demonstrations": [1, 2, 3]}).all(),
+    "where what was learnt stands": lambda s: learning.demo_states(s, [1, 2, 3]),
+    "what is known already": lambda s: learning.find_stored(s, ["0" * 64, "1" * 64]),
+    "what some styles serve": lambda s: releases.served_versions(s, {(1, "simple-running"), (2, "simple-running")}),
     "jobs": lambda s: jobs.list_jobs(s, 10, 50, None),
     "jobs of a state": lambda s: jobs.list_jobs(s, 10, 50, "failed"),
     "jobs of a kind": lambda s: jobs.list_jobs(s, 10, 50, None, "playback"),
     "jobs of a kind and a state": lambda s: jobs.list_jobs(s, 10, 50, "failed", "playback"),
     "the newest job for a plan": lambda s: newest_job(s, "playback", "0" * 64),
     "withdrawn demonstrations": lambda s: demos.list_demos(s, 10, 50, None, None, active=False),
-    "the newest of equal jobs": lambda s: jobs.newest(s, "pictures", {}),
+    "the newest of equal jobs": lambda s: jobs.newest(s, PicturesRequest(plan="0" * 64, playback="1" * 64)),
     "a batch's styles": lambda s: retraining.list_styles(s, batch(s), 10, 20, None),
     "a batch's styles of a state": lambda s: retraining.list_styles(s, batch(s), 10, 20, "failed"),
     "how far a batch is": lambda s: jobs.count(s, batch(s).row),

@@ -20,14 +20,13 @@ from skills.learning.certificate import NearLimits
 from skills.learning.dynamic_programming import Mdp, exact_q
 from skills.learning.evaluation import SpaceRollouts
 from skills.learning.networks import DDPG, DQN, Deep, Network, network_q
-from skills.learning.policy import LEARNER_VERSION, Policy, describe_learner, rollout
+from skills.learning.policy import Policy, rollout
 from skills.learning.q_learning import Training
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.integrity import learnt
 from skills.library.policies import releases
-from skills.library.policies.gate import GATE_VERSION
 from skills.library.policies.learning import certified, lessons, store_style
-from skills.library.policies.training import POSES_VERSION
+from skills.library.policies.requests import TrainingRequest
 from skills.library.recordings.demos import find_demo
 from tests.api.conftest import service  # noqa: F401 - a fixture
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service
@@ -46,11 +45,7 @@ def exact_network(reward: RewardMap) -> Network:
 def store(service: Service, learner: Deep, network: Network | None = None) -> PolicyVersion:  # noqa: F811
     """Store a possible result of a learner, as a training does."""
     demo = service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
-    request = {
-        **KESTREL, "demos": [demo["sha256"]], "learner": describe_learner(learner),
-        "learner_version": LEARNER_VERSION, "gate": GATE_VERSION, "poses": POSES_VERSION, "seed": 0, "release": False,
-        "near": asdict(NearLimits()),
-    }  # fmt: skip
+    request = TrainingRequest(**KESTREL, demos=[demo["sha256"]], learner=learner, near=NearLimits())
     with service.database.reading() as session:
         (lesson,) = lessons(session, [find_demo(session, demo["sha256"]).row])
     reward = unpack_as(RewardMap, lesson.reward)

@@ -187,7 +187,7 @@ CHANGES: dict[str, Callable[[], Files]] = {
     "the verdict swapped": lambda: edited("verdict.json", report=REPORT | {"trajectory": "6" * 64}),
     "the verdict surer": lambda: edited("verdict.json", report=REPORT | {"estimate": {"under": []}}),
     "the policy's limits removed": lambda: edited("policy.json", limits=""),
-    "the plan's words changed": lambda: edited("plan.json", in_words="It is safe near a person."),
+    "the plan's words changed": lambda: edited("plan.json", description="It is safe near a person."),
     "another plan with its own verdict": lambda: members() | papers(short()),
 }  # fmt: skip
 REPORT = {"feasible": True, "trajectory": MOTION, "arms": judged(moved(JOINTS))}

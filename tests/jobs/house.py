@@ -13,7 +13,6 @@ from sqlalchemy import ColumnElement, func, select, text
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.jobs import Engine
-from skills.library.operation.inspection import inspect_installation
 from skills.serving import environment
 from skills.settings import Settings
 from tests.backends import blank, drop
@@ -124,8 +123,7 @@ class Records:
 
     def wrong(self) -> list[tuple[str, str]]:
         """Inspect everything that is stored, as `skills verify` does, and return the faults."""
-        parts = {part.what: part for part in inspect_installation(self.database)}
-        return [wrong for part in parts.values() for wrong in part.wrong]
+        return cases.wrong(self.database)
 
     def _holders(self, which: str) -> dict[str, int]:
         query = text(f"SELECT workflow_uuid, executor_id FROM {self._workflows} WHERE {which}")

@@ -23,7 +23,7 @@ from skills.serving import environment
 from skills.settings import Settings
 from tests import backends
 from tests.jobs.house import ROOT
-from tests.library.styles import add_styles, ask_retraining, damage, look, parts_of, states_of, styles_of
+from tests.library.styles import add_styles, ask_retraining, counted, damage, look, parts_of, states_of, styles_of
 from tests.waiting import until
 
 SLOW = CellQLearning(episodes=1_500_000)  # a second or two of learning, so that a test can act midway
@@ -91,11 +91,6 @@ def nothing_is_open(database: Database, since: datetime) -> bool:
         except sqlite3.OperationalError:
             return False
         return True
-
-
-def counted(database: Database, table: type) -> int:
-    with database.reading() as session:
-        return session.scalar(select(func.count()).select_from(table))
 
 
 def done(database: Database, job: Job) -> int:

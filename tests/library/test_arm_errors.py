@@ -167,9 +167,9 @@ def test_a_table_is_read_as_the_joints_that_it_has(tmp_path: Path):
     ("given", "why"),
     [
         ({"names": NAMES[:-1]}, "no column setpoint_q6"),
-        ({"cell": "x"}, "Row 2 of the table has a cell that is no number"),
+        ({"cell": "x"}, "Row 2, column setpoint_q6: not a number"),
         ({"cell": "nan"}, "NaN"),
-        ({"rows": 0}, "0 samples hold"),
+        ({"rows": 0}, "a header and no rows"),
         ({}, "by the same number throughout"),
     ],
 )

@@ -20,8 +20,9 @@ from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans.plans import hand_of, trajectory_of
 from skills.library.policies import training
 from skills.library.policies.cards import card_of
-from skills.library.policies.combined import learnt_from, path_of
+from skills.library.policies.combined import learnt_from
 from skills.library.policies.releases import release
+from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import upload_demo, withdraw_demo
 from skills.schemas.demos import DemoIn
@@ -30,7 +31,7 @@ from skills.verification.intent import compare
 from skills.verification.requested import requested_motion
 from tests import backends
 from tests.library import cases
-from tests.library.cases import commit, fetch, wrong
+from tests.library.cases import wrong
 from tests.library.styles import counted, retrain, served
 
 SHIFTS_MM = ((0.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 1.5, 0.5))
@@ -58,7 +59,7 @@ def test_it_names_all_of_them_passes_the_gate_and_is_verified(database: Database
     with database.reading() as session:
         stored = find_by_digest(session, version.sha256)
         assert [one.sha256 for one in stored.demonstrations] == version.manifest.demos
-        assert digest(path_of(stored)) == digest(learnt(stored).path)
+        assert digest(learnt_from(stored).path) == digest(learnt(stored).path)
     said = version.manifest.combined
     assert said.kind == how
     assert len(said.width_mm) == len(version.manifest.waypoints)
@@ -87,7 +88,7 @@ def test_the_middle_lies_between_the_demonstrations(database: Database):
     demos = add_three(database)
     version = train(database, demos, combine="barycentre")
     with database.reading() as session:
-        way = learnt_from(find_by_digest(session, version.sha256))
+        way = learnt_from(find_by_digest(session, version.sha256)).demo
     between = cases.points_mm((0.0, 1.5, 0.5))
     assert dtw(way.tip_mm, between).differences_mm.sum(axis=1).mean() < 1.0
 
@@ -125,12 +126,14 @@ def test_erasing_any_of_them_erases_the_policy(database: Database, how, gone):
 )
 def test_one_that_leaves_while_it_is_learnt_from_leaves_no_policy(database: Database, leave, why):
     demos = add_three(database)
-    request = cases.ask_training(database, demos=[demo.sha256 for demo in demos]).request
-    read = fetch(database, training.lessons, [demo.row for demo in demos])
+    job = cases.ask_training(database, demos=[demo.sha256 for demo in demos])
+    request = TrainingRequest.model_validate(job.request)
+    with database.reading() as session:
+        read = training.lessons(session, [demo.row for demo in demos])
     learnt_meanwhile = training.learn_style(
-        training.combined_lesson(read, "corridor"), request, Settings(database_url=database.url)
+        training.combined_lesson(read, request.combine), request, Settings(database_url=database.url)
     )
-    commit(database, leave, demos[0].sha256, "test")
+    cases.committed(database, leave, demos[0].sha256, "test")
     with pytest.raises((Conflict, NotFound), match=why), database.writing() as session:
         training.store_style(session, learnt_meanwhile)
     assert counted(database, PolicyVersion) == 0
@@ -149,7 +152,7 @@ def test_the_overview_does_not_wait_for_a_training_of_what_is_among_them(databas
 
 def test_erasing_the_surgeon_leaves_nothing(database: Database):
     train(database, add_three(database), release=True)
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     assert [counted(database, table) for table in (PolicyVersion, PolicyDemonstration, Demonstration)] == [0, 0, 0]
 
 
@@ -160,7 +163,7 @@ def test_a_plan_follows_it_and_a_card_tells_of_it(database: Database, how):
     plan = cases.add_plan(database)
     with database.reading() as session:
         stored = find_by_digest(session, version.sha256)
-        followed, card = learnt_from(stored), card_of(session, stored)
+        followed, card = learnt_from(stored).demo, card_of(session, stored)
         assert np.abs(plan.plan.passes[0].tip_mm[-1] - [5.0, 55.0, -125.0]).max() < 1e-9
         assert dtw(plan.plan.passes[0].tip_mm, followed.tip_mm).differences_mm.sum(axis=1).mean() < 5.0
         asked = requested_motion(plan.plan, learnt(stored), hand_of(stored))
@@ -195,7 +198,7 @@ def test_what_cannot_be_combined_is_refused_before_a_job_is_made(database: Datab
     ):
         with pytest.raises(BadInput, match=why):
             cases.ask_training(database, demos=[demo.sha256 for demo in demos], combine=how)
-    commit(database, withdraw_demo, two.sha256, "test")
+    cases.committed(database, withdraw_demo, two.sha256, "test")
     with pytest.raises(Conflict, match="withdrawn"):
         cases.ask_training(database, demos=[one.sha256, two.sha256])
 
@@ -234,5 +237,6 @@ def test_a_combined_policy_is_restored_with_its_demos_on_another_back_end(databa
     with backends.opened(backends.blank(backends.OTHER[database.engine.dialect.name], tmp_path)) as other:
         restore(other, tmp_path / "all.zip")
         assert (counted(other, PolicyDemonstration), served(other), wrong(other)) == (2, [1], [])
-        commit(other, withdraw_demo, demos[0].sha256, "test")
+        with other.writing() as session:
+            withdraw_demo(session, demos[0].sha256, "test")
         assert served(other) == []

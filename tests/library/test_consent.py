@@ -23,7 +23,7 @@ from skills.library.policies import batches, learning, releases, retraining, ver
 from skills.schemas.people import Consent, SurgeonIn
 from skills.schemas.scores import ScoreIn
 from tests.library import cases
-from tests.library.cases import SUTURE, commit
+from tests.library.cases import SUTURE
 from tests.library.styles import add_styles, ask_retraining, count_versions, counted, parts_of, states_of, styles_of
 
 ALL = {"uses": ["training", "export", "atlas"], "until": None}
@@ -40,7 +40,7 @@ def on_one_day(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def agree(database: Database, to: dict[str, Any] | None, surgeon: str = "kestrel") -> None:
     """Record a surgeon's consent."""
-    commit(database, put_surgeon, surgeon, SurgeonIn.model_validate({"consent": to}), "anna")
+    cases.committed(database, put_surgeon, surgeon, SurgeonIn.model_validate({"consent": to}), "anna")
 
 
 def served(database: Database) -> int | None:
@@ -53,7 +53,7 @@ def served(database: Database) -> int | None:
         assert (shown.style.state == "released", shown.served is not None) == (bool(listed), bool(listed))
         assert len(styles.matrix(session, state="released").rows) == len(listed)
         try:
-            version = versions.policy_of(session, "kestrel", SUTURE).policy.version
+            version = versions.served_release(session, "kestrel", SUTURE).policy.version
         except NotFound:
             assert listed == []
             return None
@@ -166,7 +166,7 @@ def test_a_release_asks(database: Database):
     with database.writing() as session:
         releases.release(session, versions.find_version(session, "kestrel", SUTURE, 1), "anna")
     with database.reading() as session:
-        assert versions.policy_of(session, "kestrel", SUTURE).policy.version == 1
+        assert versions.served_release(session, "kestrel", SUTURE).policy.version == 1
 
 
 def test_who_takes_consent_back_while_an_atlas_is_measured_is_not_in_it(
@@ -217,7 +217,7 @@ def test_withdrawn_consent_withdraws_releases_and_renewal_restores_none(
         withdrawn = select(Event).where(Event.action == "withdraw", Event.object_kind == "policy-version")
         assert [one.actor for one in session.scalars(withdrawn)] == ["anna", "anna"]
         with pytest.raises(NotFound, match=r"is served\. The consent of 'kestrel' does not cover training"):
-            versions.policy_of(session, "kestrel", SUTURE)
+            versions.served_release(session, "kestrel", SUTURE)
     agree(database, ALL)
     assert served(database) is None
     with database.writing() as session:
@@ -233,7 +233,7 @@ def test_consent_serves_to_the_end_of_its_last_day_and_no_longer(database: Datab
     monkeypatch.setattr(consent, "today", lambda: TODAY + timedelta(days=1))
     assert served(database) is None
     with database.reading() as session, pytest.raises(NotFound, match=f"expired on {TODAY}"):
-        versions.policy_of(session, "kestrel", SUTURE)
+        versions.served_release(session, "kestrel", SUTURE)
     with database.writing() as session, pytest.raises(Conflict, match=f"expired on {TODAY}"):
         releases.release(session, versions.find_version(session, "kestrel", SUTURE, version.version), "anna")
     with pytest.raises(Conflict, match=f"expired on {TODAY}"):
@@ -275,7 +275,7 @@ def test_other_changes_of_a_surgeon_withdraw_nothing(database: Database):
 def test_withdrawn_consent_withdraws_a_surgeons_combined_and_other_styles(database: Database):
     demos = [cases.add_demo(database, cases.hand_off((0.0, 0.0, 1.0 * n))).sha256 for n in range(3)]
     cases.train(database, demos=demos, release=True)
-    commit(database, put_surgeon, "heron", SurgeonIn(), "test")
+    cases.committed(database, put_surgeon, "heron", SurgeonIn(), "test")
     other = cases.add_demo(database, surgeon="heron")
     cases.train(database, "heron", demos=[other.sha256], release=True)
     agree(database, NO_TRAINING)
@@ -327,7 +327,7 @@ def test_a_day_ends_in_utc(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_surgeon_of_whom_nothing_was_ever_recorded_covers_everything(database: Database):
-    commit(database, put_surgeon, "plain", SurgeonIn(), "test")
+    cases.committed(database, put_surgeon, "plain", SurgeonIn(), "test")
     with database.reading() as session:
         plain = find_surgeon(session, "plain")
         assert may(plain, "training")

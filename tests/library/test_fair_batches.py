@@ -8,7 +8,7 @@ import pytest
 
 from skills.db.models import PolicyVersion
 from skills.db.session import Database
-from skills.gridworld.grid import GridWorld
+from skills.gridworld.grid import GridPath, GridWorld
 from skills.library.policies import batches, fit, releases, versions
 from skills.library.policies.fit import compare_versions, not_worse
 from skills.library.recordings.demos import withdraw_demo
@@ -36,7 +36,7 @@ def compared(database: Database, **asked: Any) -> dict[str, Any]:
 
 def served(database: Database) -> PolicyVersion:
     with database.reading() as session:
-        return versions.policy_of(session, "kestrel", cases.SUTURE).policy
+        return versions.served_release(session, "kestrel", cases.SUTURE).policy
 
 
 def test_a_policy_of_three_demos_is_retrained_on_the_newest_three(database: Database):
@@ -159,9 +159,9 @@ def test_what_cannot_be_compared_is_worse(totals_mm: tuple[float, float]):
 
 
 def test_in_another_frame_nothing_is_compared():
-    path = fit.GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), fit.np.array([0, 1, 2]))
-    ways = [fit.PolicyPath(path.tip_mm, ("PSM2", frame)) for frame in ("PSM2_base", "jigsaws")]
-    one = fit.ReferencePath("a" * 64, ("PSM2", "PSM2_base"), path)
+    path = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), fit.np.array([0, 1, 2]))
+    ways = [fit.StylePath("b" * 64, ("PSM2", frame), path.tip_mm) for frame in ("PSM2_base", "jigsaws")]
+    one = fit.StylePath("a" * 64, ("PSM2", "PSM2_base"), path.tip_mm)
     found = fit.compare_paths(*ways, [one])
     assert (not_worse(found), found.released_mm, found.trained_mm) == (False, None, None)
     assert not_worse(fit.compare_paths(ways[0], ways[0], [one]))
@@ -175,7 +175,7 @@ def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(datab
     trained = cases.train(database, demos=three[:1], learner=cases.PUBLISHED)
     with database.writing() as session:
         version = versions.find_by_digest(session, trained.sha256)
-        found = compare_versions(session, versions.policy_of(session, "kestrel", cases.SUTURE).policy, version)
+        found = compare_versions(session, versions.served_release(session, "kestrel", cases.SUTURE).policy, version)
         assert found.demos == tuple(three)
         with pytest.raises(releases.Conflict) as refused:
             releases.release(session, version, "test")
@@ -186,8 +186,7 @@ def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(datab
 def test_a_demonstration_that_was_withdrawn_is_not_compared_with(database: Database):
     three = demos(database, *SWERVES_MM)
     first, second = cases.train(database, demos=three[:1]), cases.train(database, demos=three[1:2])
-    with database.writing() as session:
-        withdraw_demo(session, three[0], "test")
+    cases.committed(database, withdraw_demo, three[0], "test")
     with database.reading() as session:
         pair = [versions.find_by_digest(session, one.sha256) for one in (first, second)]
         assert compare_versions(session, *pair).demos == (three[1],)

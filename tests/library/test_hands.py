@@ -38,7 +38,6 @@ def turning(turn_rad: float = TURN_RAD, *, beside: bool = False) -> bytes:
 
 
 def taught(database: Database, data: bytes) -> None:
-    cases.add_surgeon(database)
     cases.store(database, cases.upload(data, "application/vnd.mcap"), arm="PSM2")
     cases.train(database, release=True)
 
@@ -78,7 +77,6 @@ def test_a_small_turn_may_be_held(database: Database):
 
 
 def test_a_version_checked_with_the_jaw_held_is_not_released(database: Database, monkeypatch: pytest.MonkeyPatch):
-    cases.add_surgeon(database)
     cases.store(database, cases.upload(turning(), "application/vnd.mcap"), arm="PSM2")
     monkeypatch.setattr(
         "skills.library.policies.gate.driven_pass",
@@ -86,13 +84,9 @@ def test_a_version_checked_with_the_jaw_held_is_not_released(database: Database,
     )
     version = cases.train(database)
     monkeypatch.undo()
-    with (
-        database.writing() as session,
-        pytest.raises(Conflict, match=r"turns by 60\.0 degrees, over 10.*train it again"),
-    ):
-        releases.release(session, session.merge(version), "test")
-    with database.writing() as session:
-        releases.release(session, session.merge(version), "test", constant_turn_deg=61.0)
+    with pytest.raises(Conflict, match=r"turns by 60\.0 degrees, over 10.*train it again"):
+        cases.release(database, version)
+    cases.release(database, version, constant_turn_deg=61.0)
 
 
 def test_a2_ends_where_both_arms_were_recorded(database: Database):
@@ -109,8 +103,7 @@ def test_a2_ends_where_both_arms_were_recorded(database: Database):
 
 
 def test_positions_alone_are_planned_with_the_jaw_held_and_said_so(database: Database):
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     plan = cases.add_plan(database)
     assert (plan.about.orientation, plan.about.departure) == ("assumed tool-down", None)
     assert plan.about.trajectory.jaw == "constant"
@@ -121,7 +114,6 @@ def test_positions_alone_are_planned_with_the_jaw_held_and_said_so(database: Dat
 
 
 def test_a_plan_of_several_follows_their_pose_style(database: Database):
-    cases.add_surgeon(database)
     demos = [
         cases.store(database, cases.upload(turning(rad), "application/vnd.mcap"), arm="PSM2")
         for rad in (TURN_RAD, TURN_RAD / 2)

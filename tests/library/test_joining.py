@@ -14,14 +14,13 @@ from skills.learning.certificate import Coverage, NearLimits, NearStarts, certif
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library.operation.integrity import covered, learnt
-from skills.library.policies import releases
-from skills.library.policies.gate import refusals
+from skills.library.policies.gate import GateLimits, refusals
 from skills.library.policies.retraining import request_retraining
-from skills.library.policies.training import near_limits, request_training
+from skills.library.policies.training import request_training
 from skills.schemas.training import RetrainingIn, TrainingIn
 from skills.settings import Settings
 from tests.library import cases
-from tests.library.styles import ask_retraining, parts_of, styles_of
+from tests.library.styles import ask_retraining, finish, styles_of
 
 HALF = PhaseQLearning(join_share=0.5)
 # A loop that ends in the cell beside its start, so that the starts on the other side of its end join there.
@@ -34,22 +33,19 @@ def loop() -> bytes:
 
 
 def test_a_loop_that_ends_beside_its_start_is_refused_with_the_remedy(database):
-    cases.add_surgeon(database)
-    cases.add_demo(database, loop())
-    version = cases.train(database)
+    version = cases.trained(database, loop())
     certificate = version.manifest.grid_certificate
     assert certificate.near == NearStarts(radius_mm=3.0, least_share=0.4, starts=7, share=0.0)
     (refused,) = certificate.refused_because
     reason = refused.text
     assert reason.startswith("of 7 starts within 3 mm of the demonstrated one, one follows only 0% of the demonstr")
     assert "train with a joining rule such as --join 0.5" in reason
-    with database.writing() as session, pytest.raises(Conflict, match=r"--join 0\.5"):
-        releases.release(session, session.merge(version), "test")
+    with pytest.raises(Conflict, match=r"--join 0\.5"):
+        cases.release(database, version)
     mended = cases.train(database, learner=HALF)
     assert mended.manifest.grid_certificate.refused_because == ()
     assert mended.manifest.grid_certificate.near.share >= 0.5
-    with database.writing() as session:
-        releases.release(session, session.merge(mended), "test")
+    cases.release(database, mended)
 
 
 @pytest.mark.parametrize(("share", "refused"), [(0.4, False), (0.39, True), (nan, True)])
@@ -61,34 +57,29 @@ def test_the_gate_refuses_a_near_start_below_its_limit_and_nan(share, refused):
 
 
 def test_the_gates_limit_is_a_setting_and_part_of_a_trainings_identity(database):
-    cases.add_surgeon(database)
-    cases.add_demo(database, loop())
-    refused = cases.train(database)
+    refused = cases.trained(database, loop())
     with database.writing() as session:
         asked = TrainingIn(surgeon="kestrel", suture=cases.SUTURE)
-        job = request_training(session, asked, "test", NearLimits(3.0, 0.0)).job
-        same = request_training(session, asked, "test", near_limits(Settings())).job
+        job = request_training(session, asked, "test", GateLimits(NearLimits(3.0, 0.0))).job
+        same = request_training(session, asked, "test", GateLimits.of(Settings())).job
     assert job.row != same.row, "an equal training under another limit is another job"
     result = cases.work(database, job).result
     assert (result["policy_version"], result["releasable"]) == (refused.version + 1, True)
 
 
 def test_a_batch_of_stale_styles_takes_those_checked_by_other_near_limits(database):
-    cases.add_surgeon(database)
-    cases.add_demo(database, loop())
-    cases.train(database)
+    cases.trained(database, loop())
     asked = RetrainingIn(surgeon="kestrel", only_stale=True)
     for near, stale in ((NearLimits(), []), (NearLimits(3.0, 0.0), [["other limits at the near starts"]])):
-        job = request_retraining(database, asked, "test", near)[0]
+        job = request_retraining(database, asked, "test", GateLimits(near))[0]
         assert [style.stale for style in styles_of(database, job)] == stale
 
 
 def test_the_default_of_the_settings_is_that_of_the_gate():
-    assert near_limits(Settings()) == NearLimits()
+    assert GateLimits.of(Settings()).near == NearLimits()
 
 
 def test_a_manifest_states_shares_and_by_another_rule_a_table(database):
-    cases.add_surgeon(database)
     cases.add_demo(database)
     nearest, half = cases.train(database), cases.train(database, learner=HALF)
     for version in (nearest, half):
@@ -108,7 +99,6 @@ def test_a_manifest_states_shares_and_by_another_rule_a_table(database):
 
 
 def test_a_batch_keeps_the_rule_of_each_style_unless_it_names_a_learner(database):
-    cases.add_surgeon(database)
     cases.add_surgeon(database, "osprey")
     cases.add_demo(database)
     cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)), "osprey")
@@ -126,11 +116,6 @@ def test_a_batch_keeps_the_rule_of_each_style_unless_it_names_a_learner(database
     assert style.policy.manifest.settings["join_share"] == 0
     assert any("of the demonstration on average" in why for why in style.comparison.worse_because)
     assert not style.comparison.now_released
-
-
-def finish(database, job):
-    for part in parts_of(database, job):
-        cases.work(database, part)
 
 
 @pytest.mark.parametrize("learner", [PhaseQLearning(), CellQLearning()])

@@ -29,7 +29,8 @@ from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies import releases
-from skills.library.policies.versions import policy_of
+from skills.library.policies.requests import TrainingRequest
+from skills.library.policies.versions import served_release
 from skills.library.recordings.demos import add_demo, find_demo, withdraw_demo
 from skills.library.recordings.recordings import recording_bytes, store_recording
 from skills.schemas.demos import DemoIn
@@ -37,7 +38,6 @@ from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
-from tests.library.cases import commit
 
 AT_ONCE = 8
 SHAKE = np.random.default_rng(5).normal(0, 0.4, (150, 3)).clip(-1, 1)  # mm, less than a quarter of a cell
@@ -60,7 +60,7 @@ def counts(database: Database) -> dict[str, int]:
 
 
 def test_the_catalogue_is_seeded_once(database: Database):
-    assert commit(database, seed_suture_types) == 0
+    assert cases.committed(database, seed_suture_types) == 0
     assert counts(database)["suture_types"] == 11
 
 
@@ -136,7 +136,7 @@ def test_a_hysteresis_that_cannot_be_meant_leaves_no_row(database: Database):
 
 def test_the_same_surgeon_eight_times_at_once_is_one_surgeon(database: Database):
     def put(_: int) -> None:
-        commit(database, put_surgeon, "heron", SurgeonIn(), "test")
+        cases.committed(database, put_surgeon, "heron", SurgeonIn(), "test")
 
     at_once(put)
     assert counts(database)["surgeons"] == 2
@@ -168,14 +168,14 @@ def test_the_same_training_gives_the_same_digest_in_any_database(database: Datab
 
 def interrupted(monkeypatch: pytest.MonkeyPatch, meanwhile: Callable[[], None]) -> None:
     """Run a callback after the learning and before its result is stored."""
-    train = library.MAKERS["training"]
+    train = library.PERFORMERS[TrainingRequest]
 
     def make(*asked: Any) -> Any:
         store = train(*asked)
         meanwhile()
         return store
 
-    monkeypatch.setitem(library.MAKERS, "training", make)
+    monkeypatch.setitem(library.PERFORMERS, TrainingRequest, make)
 
 
 def test_a_job_cancelled_while_it_learns_leaves_no_policy(database: Database, monkeypatch: pytest.MonkeyPatch):
@@ -183,7 +183,7 @@ def test_a_job_cancelled_while_it_learns_leaves_no_policy(database: Database, mo
     job = cases.ask_training(database, release=True)
 
     def cancel() -> None:
-        commit(database, jobs.cancel, job.id, "test")
+        cases.committed(database, jobs.cancel, job.id, "test")
 
     interrupted(monkeypatch, cancel)
     assert cases.work(database, job).state == "cancelled"
@@ -196,7 +196,7 @@ def test_a_demonstration_withdrawn_while_it_is_learnt_leaves_no_policy(
     demo = cases.add_demo(database)
 
     def withdraw() -> None:
-        commit(database, withdraw_demo, demo.sha256, "test")
+        cases.committed(database, withdraw_demo, demo.sha256, "test")
 
     interrupted(monkeypatch, withdraw)
     job = cases.work(database, cases.ask_training(database, release=True))
@@ -209,7 +209,7 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
     job = cases.ask_training(database)
 
     def erase() -> None:
-        commit(database, erase_surgeon, "kestrel", "test")
+        cases.committed(database, erase_surgeon, "kestrel", "test")
 
     interrupted(monkeypatch, erase)
     with database.writing() as session:
@@ -220,8 +220,7 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
 
 
 def test_erasure_leaves_no_row_and_events_without_a_name(database: Database):
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     cases.add_plan(database)
     with database.writing() as session:
         subject = find_surgeon(session, "kestrel").subject
@@ -251,14 +250,13 @@ def test_what_was_released_is_what_was_learnt(database: Database):
     demo = cases.add_demo(database)
     version = cases.train(database, release=True)
     with database.reading() as session:
-        served = policy_of(session, "kestrel", cases.SUTURE)
+        served = served_release(session, "kestrel", cases.SUTURE)
         assert served.policy.sha256 == version.sha256
         assert learnt(served.policy).path.states.tolist() == find_demo(session, demo.sha256).path.states.tolist()
 
 
 def test_the_first_page_shows_what_the_manifest_states(database: Database):
-    cases.add_demo(database)
-    cases.train(database)
+    cases.trained(database)
     with database.reading() as session:
         manifest = session.scalars(select(PolicyVersion.manifest)).one()
         assert tile(session) == (manifest.waypoints, pytest.approx(manifest.coverage.mean_share))
@@ -274,20 +272,18 @@ def tile(session: Session) -> tuple[list[int], float]:
 
 
 def test_what_value_iteration_finds_may_be_released(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=ValueIteration())
+    version = cases.trained(database, learner=ValueIteration())
     assert version.releasable
     assert version.manifest.learner == "value-iteration"
     assert version.manifest.metrics.dtw_total_mm == 0
     with database.writing() as session:
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
     with database.reading() as session:
-        assert policy_of(session, "kestrel", cases.SUTURE).policy.row == version.row
+        assert served_release(session, "kestrel", cases.SUTURE).policy.row == version.row
 
 
 def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=MaxEntIRL(iterations=30))
+    version = cases.trained(database, learner=MaxEntIRL(iterations=30))
     with database.writing() as session:
         kept = session.get_one(PolicyVersion, version.row)
         assert learnt(kept).learner == MaxEntIRL(iterations=30)
@@ -297,8 +293,7 @@ def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: D
 
 
 def test_a_failing_version_is_not_released_whatever_its_row_says(database: Database):
-    cases.add_demo(database)
-    version = cases.train(database, learner=cases.PUBLISHED)
+    version = cases.trained(database, learner=cases.PUBLISHED)
     with database.writing() as session, pytest.raises(Conflict, match="do not reach the goal"):
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
     assert "releases" not in counts(database)

@@ -21,6 +21,7 @@ from skills.library.people.erasure import delete_recording, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job
 from skills.library.policies.releases import in_force, release
+from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.training import request_training, train_style
 from skills.library.policies.versions import find_version
 from skills.library.recordings.demos import add_demo
@@ -70,7 +71,7 @@ def learnt(database: Database, job: Job) -> jobs.Store:
     """Carry out a training up to the transaction that stores its result."""
     with database.writing([locks.job(job.row)]) as session:
         session.get_one(Job, job.row).state = "running"
-    return train_style(database, job.request, Settings(database_url=database.url))  # type: ignore[arg-type]
+    return train_style(database, TrainingRequest.model_validate(job.request), Settings(database_url=database.url))
 
 
 def perform(database: Database, job: Job) -> None:
@@ -86,8 +87,7 @@ def put(database: Database, slug: str, **about: Any) -> bool:
 
 
 def erase(database: Database) -> None:
-    with database.writing() as session:
-        erase_surgeon(session, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
 
 
 def served(database: Database) -> list[int]:

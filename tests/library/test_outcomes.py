@@ -21,7 +21,7 @@ from skills.library.operation.styles import matrix
 from skills.library.people.erasure import erase_demo
 from skills.library.policies.cards import card_of
 from skills.library.policies.gate import remedy
-from skills.library.policies.releases import release
+from skills.library.policies.requests import TrainingRequest
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256
@@ -31,8 +31,8 @@ from skills.schemas.policies import GateRefusal
 from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
-from tests.library.cases import commit, fetch, wrong
-from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, served, styles_of
+from tests.library.cases import fetch, wrong
+from tests.library.styles import ask_retraining, counted, finish, look, retrain, served, styles_of
 
 WHY = "The needle fell."
 FAILED = pytest.mark.parametrize("outcome", ["recovery", "failure"])
@@ -43,12 +43,8 @@ def add(database: Database, shift_mm: float = 0.0, **cut: object) -> Demonstrati
 
 
 def mark(database: Database, demo: Demonstration, outcome: str, reason: str | None = WHY) -> Demonstration:
-    return commit(database, mark_demo, demo.sha256, outcome, reason, "test")
-
-
-def release_again(database: Database, version: PolicyVersion) -> None:
     with database.writing() as session:
-        release(session, find_by_digest(session, version.sha256), "test")
+        return mark_demo(session, demo.sha256, outcome, reason, "test")
 
 
 def actions(database: Database) -> Sequence[tuple[str, str]]:
@@ -130,7 +126,7 @@ def test_a_mark_is_seen_with_its_surgeon_and_goes_with_its_demonstration(databas
     with database.seen_by(Only("somebody", frozenset({mine.surgeon_row}))).reading() as session:
         assert session.scalars(select(DemonstrationOutcome.demonstration_row)).all() == [mine.row]
         assert [one.outcome for one in list_demos(session, 10, None, None, None)] == ["failure"]
-    commit(database, erase_demo, mine.sha256, "test")
+    cases.committed(database, erase_demo, mine.sha256, "test")
     assert counted(database, DemonstrationOutcome) == 1
     assert wrong(database) == []
 
@@ -225,13 +221,13 @@ def test_a_mark_withdraws_the_releases_that_rest_on_it(database: Database, outco
     mark(database, demo, outcome)
     assert served(database) == []  # the one before does not come back by itself
     with pytest.raises(Conflict, match=f"its demonstration was marked {outcome}") as refused:
-        release_again(database, version)
+        cases.release(database, version)
     assert "was marked" in refused.value.message
     assert remedy([GateRefusal("marked", "")]).startswith("Train from another demonstration, or with outcomes 'any'")
     assert wrong(database) == []
     mark(database, demo, "success", None)
     assert served(database) == []
-    release_again(database, version)
+    cases.release(database, version)
     assert served(database) == [2]
 
 
@@ -253,7 +249,7 @@ def test_a_policy_trained_from_any_outcome_stays_released(database: Database):
     with database.writing() as session:
         for one in session.scalars(select(Release)):
             one.withdrawn_at = one.released_at
-    release_again(database, version)
+    cases.release(database, version)
     assert served(database) == [1]
     assert wrong(database) == []
 
@@ -271,14 +267,14 @@ def test_a_mark_made_while_a_style_is_learnt(
     database: Database, monkeypatch: pytest.MonkeyPatch, outcomes: str, made: int
 ):
     demo = add(database)
-    train = library.MAKERS["training"]
+    train = library.PERFORMERS[TrainingRequest]
 
     def make(*asked: object) -> object:
         store = train(*asked)
         mark(database, demo, "failure")
         return store
 
-    monkeypatch.setitem(library.MAKERS, "training", make)
+    monkeypatch.setitem(library.PERFORMERS, TrainingRequest, make)
     job = cases.work(database, cases.ask_training(database, release=True, outcomes=outcomes))
     assert job.state == ("succeeded" if made else "failed")
     if not made:
@@ -303,8 +299,7 @@ def test_a_mark_made_before_a_batch_learns_fails_its_style(database: Database):
     demo = add(database)
     job = ask_retraining(database, release=True)
     mark(database, demo, "failure")
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     (style,) = styles_of(database, job)
     assert (style.state, style.reason.split(" while ")[0]) == ("failed", "A demonstration was marked failure")
     assert (look(database, job).state, counted(database, PolicyVersion)) == ("failed", 0)
@@ -317,8 +312,7 @@ def test_a_batch_whose_demonstrations_have_all_been_marked_says_so(database: Dat
     for demo in demos:
         mark(database, demo, "failure")
     assert served(database) == [1]
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     (style,) = styles_of(database, job)
     assert style.state == "failed" and "withdrawn or marked since" in style.reason
 
@@ -376,7 +370,7 @@ def test_a_mark_made_after_the_backup_is_made_again(
         outcomes = {one.sha256: one.outcome for one in session.scalars(select(Demonstration))}
     assert outcomes == {demo.sha256: "failure", other.sha256: "recovery"}
     with pytest.raises(Conflict, match="was marked failure"):
-        release_again(after, version)
+        cases.release(after, version)
     assert wrong(after) == []
     assert "Doe" not in (tmp_path / "list.json").read_text()
 

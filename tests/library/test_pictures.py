@@ -17,14 +17,14 @@ from skills.library.operation.jobs import cancel
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.plans import playbacks
 from skills.library.plans.plans import trajectory_of
-from skills.library.plans.playback_pictures import draw_pictures, find_pictures
+from skills.library.plans.playback_pictures import PicturesRequest, draw_pictures, find_pictures
 from skills.planning.trajectory import time_parametrise
 from skills.settings import Settings
 from skills.simulation import film, pictures
 from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
-from tests.library.cases import commit, fetch
+from tests.library.cases import fetch
 from tests.library.verdicts import verdict_on
 from tests.planning.motions import hand_off, ideal_playback
 from tests.planning.test_trajectory import BESIDE
@@ -51,8 +51,7 @@ def store_playback(session: Session, plan: Plan, sha256: str, measured: Playback
 @pytest.fixture
 def playback(database: Database) -> StoredPlayback:
     """Return a playback whose pictures are still to be drawn."""
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     plan = cases.add_plan(database)
     with database.writing() as session:
         measured = ideal_playback(trajectory_of(planned(session.get_one(Plan, plan.row))))
@@ -84,9 +83,9 @@ def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
     monkeypatch.setattr(film, "FRAMES_PER_PASS", 2)
     [job] = asked(database)
     assert job.id in refusal(database, playback)
-    store = draw_pictures(database, job.request, Settings(database_url=database.url))
+    store = draw_pictures(database, PicturesRequest.model_validate(job.request), Settings(database_url=database.url))
     for _ in range(2):  # the second time by a worker that does not know of the first
-        assert commit(database, store, "test") == {"playback": playback.sha256}
+        assert cases.committed(database, store, "test") == {"playback": playback.sha256}
     assert len(drawn(database)) == 1
     found = fetch(database, find_pictures, playback)
     assert found.animation_mp4[4:8] == b"ftyp"
@@ -100,7 +99,8 @@ def test_asking_again_gives_the_same_job_until_it_has_failed(database: Database,
         assert playbacks.request_pictures(session, playback, "test")[0].row == job.row
         cancel(session, job.id, "test")
     assert f"client.draw('{playback.sha256}')" in refusal(database, playback)
-    again, new = commit(database, playbacks.request_pictures, playback, "test")
+    with database.writing() as session:
+        again, new, _ = playbacks.request_pictures(session, playback, "test")
     assert new and again.row != job.row
     assert again.id in refusal(database, playback)
 

@@ -18,7 +18,8 @@ from skills.formats.bag_writer import write_mcap
 from skills.formats.parsed import parse_recording
 from skills.learning.pose_style import PHASES
 from skills.library.operation.backup import back_up, restore
-from skills.library.operation.inspection import HISTORY, inspect_installation
+from skills.library.operation.inspection import HISTORY
+from skills.library.operation.jobs import PartRequest
 from skills.library.people.erasure import erase_demo
 from skills.library.people.surgeons import put_surgeon
 from skills.library.policies import learning, training
@@ -30,7 +31,7 @@ from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
-from tests.library.cases import commit, fetch
+from tests.library.cases import wrong
 from tests.library.styles import NO_CONSENT, ask_retraining, parts_of, retrain, states_of
 
 MCAP = "application/vnd.mcap"
@@ -106,13 +107,7 @@ def rows_of(database: Database) -> list[Any]:
         return [tuple(row) for row in session.execute(text("SELECT sha256, policy_row, poses FROM pose_styles"))]
 
 
-def wrong(database: Database) -> list[tuple[str, str]]:
-    parts = {id(part): part for part in inspect_installation(database)}.values()
-    return [one for part in parts if part.what != HISTORY for one in part.wrong]
-
-
 def test_a_training_stores_the_poses_of_its_demonstration(database: Database):
-    cases.add_surgeon(database)
     demo = add(database, turning())
     version = cases.train(database)
     with database.reading() as session:
@@ -129,7 +124,6 @@ def test_a_training_stores_the_poses_of_its_demonstration(database: Database):
 
 
 def test_several_demonstrations_give_one_pose_style_at_one_place(database: Database):
-    cases.add_surgeon(database)
     demos = [add(database, turning(shift)) for shift in (0.0, 2.5, 1.0)]
     version = cases.train(database, demos=[one.sha256 for one in demos])
     with database.reading() as session:
@@ -142,16 +136,13 @@ def test_several_demonstrations_give_one_pose_style_at_one_place(database: Datab
 
 
 def test_a_batch_stores_pose_styles_too(database: Database):
-    cases.add_surgeon(database)
     add(database, turning())
     assert retrain(database, release=True).state == "succeeded"
     assert stored(database) == 1
 
 
 def test_a_demonstration_without_orientation_has_no_pose_style(database: Database):
-    cases.add_surgeon(database)
-    cases.add_demo(database)
-    version = cases.train(database, release=True)
+    version = cases.trained(database, release=True)
     with database.reading() as session, pytest.raises(NotFound, match="has no orientation") as refused:
         poses_of(session.get_one(PolicyVersion, version.row))
     assert not any(isinstance(one, Remedy) for one in refused.value.remedies)
@@ -159,7 +150,6 @@ def test_a_demonstration_without_orientation_has_no_pose_style(database: Databas
 
 
 def test_a_motion_too_quick_for_its_tube_is_not_served(database: Database):
-    cases.add_surgeon(database)
     tip = cases.points_mm()
     add(database, turning(tip=np.concatenate([tip[:20], tip[58:]])))  # across the grid between two samples
     version = cases.train(database, release=True)
@@ -169,11 +159,10 @@ def test_a_motion_too_quick_for_its_tube_is_not_served(database: Database):
 
 
 def test_a_pose_style_is_erased_with_its_demonstration(database: Database):
-    cases.add_surgeon(database)
     demo = add(database, turning())
     cases.train(database)
     assert stored(database) == 1
-    commit(database, erase_demo, demo.sha256, "test")
+    cases.committed(database, erase_demo, demo.sha256, "test")
     assert stored(database) == 0
 
 
@@ -182,7 +171,6 @@ def test_a_pose_style_is_erased_with_its_demonstration(database: Database):
 
 def test_the_other_arm_is_stored_as_it_was_demonstrated(database: Database):
     """By hand: phase k of 100 is k hundredths of the straight way from 45 to 17 mm along x."""
-    cases.add_surgeon(database)
     add_both(database)
     other = beside(database, cases.train(database))
     assert other is not None and other.arm == "PSM1"
@@ -193,7 +181,6 @@ def test_the_other_arm_is_stored_as_it_was_demonstrated(database: Database):
 
 
 def test_a_demonstration_moved_as_a_whole_moves_the_other_arm(database: Database):
-    cases.add_surgeon(database)
     demos = [add_both(database, shift) for shift in (0.0, 3.5)]
     here, there = (beside(database, cases.train(database, demos=[demo.sha256])) for demo in demos)
     assert here is not None and there is not None
@@ -203,7 +190,6 @@ def test_a_demonstration_moved_as_a_whole_moves_the_other_arm(database: Database
 
 @pytest.mark.parametrize("without", [{"other": None}, {"other_s": 0.5}, {"other": "PSM3"}])
 def test_the_other_arm_is_learnt_if_every_recording_has_it_all_along(database: Database, without: dict[str, Any]):
-    cases.add_surgeon(database)
     has = [add_both(database, shift) for shift in (0.0, 2.5)]
     has_not = add(database, turning(1.0, **{"other": "PSM1"} | without), arm="PSM2", segment="whole")
     both = cases.train(database, demos=[one.sha256 for one in has], combine="corridor")
@@ -215,7 +201,6 @@ def test_the_other_arm_is_learnt_if_every_recording_has_it_all_along(database: D
 
 
 def test_a_batch_learns_the_other_arm_too(database: Database):
-    cases.add_surgeon(database)
     add_both(database)
     assert retrain(database, release=True).state == "succeeded"
     with database.reading() as session:
@@ -226,14 +211,13 @@ def test_a_batch_learns_the_other_arm_too(database: Database):
 def test_a_batch_tries_a_style_again_whose_recording_cannot_be_read_now(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ):
-    cases.add_surgeon(database)
     add_both(database)
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
     with monkeypatch.context() as now:
         now.setattr(learning, "stored_recording", busy)
         with pytest.raises(Busy):
-            retrain_part(database, part.request, Settings(database_url=database.url))
+            retrain_part(database, PartRequest.model_validate(part.request), Settings(database_url=database.url))
     assert states_of(database, job) == ["queued"]
     cases.work(database, part)
     assert states_of(database, job) == ["done"]
@@ -244,7 +228,6 @@ def busy(*_: Any) -> None:
 
 
 def test_a_recording_that_is_not_cached_is_read_again(database: Database):
-    cases.add_surgeon(database)
     add_both(database)
     cached = beside(database, cases.train(database))
     with database.writing() as session:
@@ -256,34 +239,31 @@ def test_a_recording_that_is_not_cached_is_read_again(database: Database):
 
 
 def test_no_recording_is_read_where_the_other_arm_is_not_known(database: Database, monkeypatch: pytest.MonkeyPatch):
-    cases.add_surgeon(database)
     add(database, turning())
     monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     assert beside(database, cases.train(database)) is None
 
 
 def test_no_recording_is_read_without_consent(database: Database, monkeypatch: pytest.MonkeyPatch):
-    cases.add_surgeon(database)
     add_both(database)
     job = cases.ask_training(database)
-    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
+    cases.committed(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
     monkeypatch.setattr(learning, "stored_recording", lambda *_: pytest.fail("it was read"))
     ended = cases.work(database, job)
     assert ended.state == "failed" and "consent" in (ended.error or "")
 
 
 def test_a_recording_that_was_erased_meanwhile_is_named(database: Database):
-    cases.add_surgeon(database)
     demo = add_both(database)
-    read = fetch(database, training.lessons, [demo.row])
-    commit(database, erase_demo, demo.sha256, "test")
+    with database.reading() as session:
+        read = training.lessons(session, [demo.row])
+    cases.committed(database, erase_demo, demo.sha256, "test")
     with pytest.raises(NotFound, match=r"A demonstration was erased while the training used it\."):
         training.with_partners(database, read, parse_recording)
 
 
 @pytest.mark.nightly  # by day tests/library/test_backup.py counts every table
 def test_a_backup_holds_the_pose_styles(database: Database, tmp_path: Path):
-    cases.add_surgeon(database)
     add(database, turning())
     cases.train(database)
     back_up(database, tmp_path / "all.zip")
@@ -294,9 +274,7 @@ def test_a_backup_holds_the_pose_styles(database: Database, tmp_path: Path):
 
 @pytest.mark.parametrize("changed", ["sha256 = 'e' || substr(sha256, 2)", "policy_row = 1"])
 def test_a_changed_pose_style_is_refused_and_found(database: Database, changed: str):
-    cases.add_surgeon(database)
-    cases.add_demo(database)
-    cases.train(database)
+    cases.trained(database)
     demo = add(database, turning(2.5))
     version = cases.train(database, demos=[demo.sha256])
     on = "" if database.engine.dialect.name == "sqlite" else " ON pose_styles"
@@ -305,6 +283,6 @@ def test_a_changed_pose_style_is_refused_and_found(database: Database, changed: 
         session.execute(text(f"UPDATE pose_styles SET {changed}"))
     with database.reading() as session, pytest.raises((Corrupt, NotFound)):
         poses_of(session.get_one(PolicyVersion, version.row))
-    ((where, why),) = wrong(database)
+    ((where, why),) = wrong(database, HISTORY)
     assert where.startswith("pose_styles") and "does not match its digest" in why
-    commit(database, withdraw_demo, demo.sha256, "test")
+    cases.committed(database, withdraw_demo, demo.sha256, "test")

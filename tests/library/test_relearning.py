@@ -1,7 +1,7 @@
 """`skills verify --relearn`: certificates and policies computed again agree, and consistent changes are named."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,9 @@ from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import NotFound
 from skills.formats.parsed import parse_recording
-from skills.learning.certificate import NearLimits
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
-from skills.learning.policy import LEARNER_VERSION
+from skills.learning.policy import LEARNER_VERSION, Policy
 from skills.learning.q_learning import PhaseQLearning
 from skills.library.operation import inspection
 from skills.library.operation.inspection import Checked, inspect_policies
@@ -26,13 +25,13 @@ from skills.library.operation.integrity import demo_identity, poses_identity_of
 from skills.library.policies.gate import GATE_VERSION
 from skills.library.policies.learning import certified, lessons
 from skills.library.policies.relearning import compute_again, decoded
+from skills.library.policies.requests import request_of
 from skills.library.recordings.demos import mark_demo
 from skills.schemas.policies import PolicyManifest
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
 from tests.library.attacks import tampering
-from tests.library.cases import commit
 from tests.library.test_pose_styles import add_both
 from tests.library.test_scenes import SCENE, SLIPPING
 
@@ -57,7 +56,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cases.train(database, learner=cases.PUBLISHED)
     cases.train(database, scene=SCENE.as_json(), learner=SLIPPING)
     cases.train(database, learner=ValueIteration(), combine="corridor", **two)
-    commit(database, mark_demo, demos[1].sha256, "recovery", None, "test")
+    cases.committed(database, mark_demo, demos[1].sha256, "recovery", None, "test")
     cases.train(database, outcomes="any", combine="corridor", **two)
     with database.writing() as session:  # not as when it was learnt from
         mark_demo(session, demos[2].sha256, "failure", None, "test")
@@ -101,6 +100,13 @@ def test_with_a_limit_some_are_learnt_again_and_the_others_certified(database):
     }
 
 
+def stored(database: Database, row: int = 1) -> tuple[Policy, PolicyManifest]:
+    """Return a stored policy and its manifest."""
+    with database.reading() as session:
+        version = session.get_one(PolicyVersion, row)
+        return version.learnt, version.manifest
+
+
 def rewritten(database: Database, row: int, policy: Any, manifest: PolicyManifest) -> None:
     """Write a policy and a manifest with the digest of both, past the triggers."""
     value = {"learnt": policy, "manifest": manifest, "sha256": manifest.identity(digest(policy))}
@@ -110,9 +116,7 @@ def rewritten(database: Database, row: int, policy: Any, manifest: PolicyManifes
 
 
 def test_a_certificate_with_better_figures_and_its_digest_is_named(database):
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, 2)
-        policy, manifest = version.learnt, version.manifest
+    policy, manifest = stored(database, 2)
     metrics = replace(manifest.metrics, dtw_total_mm=1.5, rmse_mm=(0.5, 0.5, 0.5))
     rewritten(database, 2, policy, manifest.model_copy(update={"metrics": metrics}))
     for how in (RELEARN, None):
@@ -132,7 +136,7 @@ def test_other_actions_with_certificate_and_digests_are_named(database):
     q = policy.q.copy()
     q[policy.domain.certified] *= 1.0 + 1e-12
     forged = replace(policy, q=q)
-    made = certified(lesson, {**_request(manifest), "release": False}, demo, forged)
+    made = certified(lesson, request_of(manifest), demo, forged)
     rewritten(database, 1, forged, made.manifest)
     with tampering(database) as connection:
         connection.execute(
@@ -173,11 +177,6 @@ def test_another_motion_of_the_other_arm_with_its_digest_is_named(tmp_path: Path
     database.close()
 
 
-def _request(manifest: PolicyManifest) -> dict[str, Any]:
-    names = ("surgeon", "suture", "demos", "seed", "learner_version")
-    return {name: getattr(manifest, name) for name in names} | {"gate": GATE_VERSION, "near": asdict(NearLimits())}
-
-
 def test_a_demonstration_other_than_its_recording_is_named(database):
     """Moved by a micrometre, which changes no cell, with the digest of its stored form."""
     with database.reading() as session:
@@ -193,10 +192,8 @@ def test_a_demonstration_other_than_its_recording_is_named(database):
 
 
 def test_a_version_of_an_older_learner_is_never_called_whole(database):
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, 1)
-        policy, manifest = version.learnt, version.manifest.model_copy(update={"learner_version": LEARNER_VERSION - 1})
-    rewritten(database, 1, policy, manifest)
+    policy, manifest = stored(database)
+    rewritten(database, 1, policy, manifest.model_copy(update={"learner_version": LEARNER_VERSION - 1}))
     made = f"made by an older learner (version {LEARNER_VERSION - 1}, now {LEARNER_VERSION})"
     found = parts(database)
     assert found[CERTIFICATES].left_out == [("policy_versions 1", f"{made}, its certificate was not computed again")]
@@ -205,9 +202,7 @@ def test_a_version_of_an_older_learner_is_never_called_whole(database):
 
 
 def test_of_an_older_gate_only_the_values_are_compared(database):
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, 1)
-        policy, manifest = version.learnt, version.manifest
+    policy, manifest = stored(database)
     older = {"grid_certificate": replace(manifest.grid_certificate, gate=GATE_VERSION - 1)}
     rewritten(database, 1, policy, manifest.model_copy(update=older))
     part = parts(database)[RELEARNT]
@@ -219,9 +214,7 @@ def test_of_an_older_gate_only_the_values_are_compared(database):
 
 
 def test_a_policy_of_a_network_is_certified_again_and_not_learnt_again(database):
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, 1)
-        policy, manifest = version.learnt, version.manifest
+    policy, manifest = stored(database)
     rewritten(database, 1, replace(policy, network=Network.of([(np.zeros((27, 3)), np.zeros(27))])), manifest)
     found = parts(database)
     assert found[RELEARNT].left_out == [
@@ -240,7 +233,7 @@ def test_what_was_erased_meanwhile_is_not_called_wrong(database, monkeypatch):
 
 
 def test_without_consent_nothing_is_learnt_again(database):
-    commit(database, cases.agree, {"uses": []})
+    cases.committed(database, cases.agree, {"uses": []})
     part = parts(database)[RELEARNT]
     assert part.wrong == []
     assert len(part.left_out) == 6

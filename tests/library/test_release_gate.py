@@ -23,7 +23,7 @@ from skills.learning.certificate import NearLimits, certify, near_starts
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.library.policies import gate, learning, releases, retraining, training
+from skills.library.policies import gate, learning, requests
 from skills.schemas.people import Consent
 from skills.schemas.policies import GateRefusal
 from tests.formats.bags import sample_folder
@@ -49,7 +49,6 @@ def reaching(y_mm: float) -> bytes:
 
 
 def trained(database, data: bytes, **how):
-    cases.add_surgeon(database)
     upload = cases.upload(data, "application/vnd.mcap", **how)
     cases.store(database, upload)
     return cases.train(database)
@@ -62,8 +61,7 @@ def test_a_real_bag_whose_samples_are_all_within_the_limits_is_released(database
     driven = version.manifest.grid_certificate.driven
     assert (driven.path, driven.frame, driven.beyond) == ("fitted", "PSM2_base", 0)
     assert driven.cell_centres_beyond == 1  # reported, because a rollout names them; no arm follows them in a plan
-    with database.writing() as session:
-        releases.release(session, session.merge(version), "test")
+    cases.release(database, version)
 
 
 def test_a_pass_within_limits_is_accepted_despite_cell_centres_beyond_them(database):
@@ -92,21 +90,21 @@ def test_a_pass_beyond_a_limit_is_refused_with_place_joint_and_amount(database):
     assert f"pitch -{LIMIT_RAD + beyond:.4f} rad, {beyond:.4f} rad beyond" in reason
     assert "fitted path" in reason
     assert not version.releasable
-    with database.writing() as session, pytest.raises(Conflict, match="pitch"):
-        releases.release(session, session.merge(version), "test")
+    with pytest.raises(Conflict, match="pitch"):
+        cases.release(database, version)
 
 
 def test_a_batch_of_stale_styles_takes_what_an_older_gate_refused(database, monkeypatch):
     trained(database, reaching(138.5))
     assert styles_of(database, ask_retraining(database, only_stale=True)) == []
-    monkeypatch.setattr(retraining, "GATE_VERSION", retraining.GATE_VERSION + 1)
+    monkeypatch.setattr(requests, "GATE_VERSION", requests.GATE_VERSION + 1)
     (style,) = styles_of(database, ask_retraining(database, only_stale=True))
     assert style.stale == ["refused by an older gate"]
 
 
 def test_a_release_refused_by_an_older_gate_is_learnt_again_on_request(database, monkeypatch):
     """A training under today's gate has another job identity, so that the old refusal is not returned for it."""
-    monkeypatch.setattr(training, "GATE_VERSION", training.GATE_VERSION - 1)
+    monkeypatch.setattr(requests, "GATE_VERSION", requests.GATE_VERSION - 1)
     old = trained(database, reaching(135))
     monkeypatch.undo()
     assert cases.train(database).version == old.version + 1
@@ -125,8 +123,7 @@ def test_poses_in_a_cameras_frame_are_released_if_joints_show_the_base(database,
     assert (version.manifest.frame, version.manifest.instrument) == ("PSM2_base", instrument)
     assert version.manifest.grid_certificate.refused_because == ()
     np.testing.assert_allclose(version.manifest.start_mm, (-10.0, 55.0, -135.0), atol=1e-3)
-    with database.writing() as session:
-        releases.release(session, session.merge(version), "test")
+    cases.release(database, version)
 
 
 def test_an_instrument_without_constants_is_named_and_not_released(database):

@@ -43,7 +43,6 @@ from skills.verification.probabilities import JUDGE_VERSION
 from tests.independent_history import check_envelope
 from tests.library import cases
 from tests.library.attacks import tampering
-from tests.library.cases import commit
 from tests.library.verdicts import doubt_of, verdict_on
 from tests.planning.motions import ideal_playback
 
@@ -75,11 +74,16 @@ def gate(database: Database, plan: Plan, **asked: Any) -> str:
         return cleared(session, row, planned(row), replace(OF_A1_ALONE, **asked)).sha256
 
 
+def refused(database: Database, plan: Plan, words: str, **asked: Any) -> None:
+    """Check that the gate refuses a plan in these words."""
+    with pytest.raises(Conflict, match=words):
+        gate(database, plan, **asked)
+
+
 @pytest.fixture
 def plan(database: Database) -> Plan:
     """Return a plan of the released policy, not played yet."""
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     return cases.add_plan(database)
 
 
@@ -87,23 +91,19 @@ def plan(database: Database) -> Plan:
 
 
 def test_a_plan_is_cleared_by_its_own_newest_feasible_playback(database: Database, plan: Plan):
-    with pytest.raises(Conflict, match=r"not played in the simulator yet. Play it: client.play\("):
-        gate(database, plan)
+    refused(database, plan, r"not played in the simulator yet. Play it: client.play\(")
     other = cases.add_plan(database, speed_mm_s=10.0)
     judged(database, other)
-    with pytest.raises(Conflict, match="not played"):
-        gate(database, plan)
+    refused(database, plan, "not played")
     first = judged(database, plan)
     assert gate(database, plan) == first
     newer = judged(database, plan, samples=7)
     assert gate(database, plan) == newer
     judged(database, plan, estimate=doubt_of(0.5))
-    with pytest.raises(Conflict, match=r"only 0.500, and 0.9 is required"):
-        gate(database, plan)
+    refused(database, plan, r"only 0.500, and 0.9 is required")
     gate(database, plan, lower_bound=0.5)
     judged(database, plan, feasible=False)
-    with pytest.raises(Conflict, match="infeasible: Pass 0, A1, sample 3"):
-        gate(database, plan)
+    refused(database, plan, "infeasible: Pass 0, A1, sample 3")
     judged(database, plan, digest="1" * 64)
     with pytest.raises(Corrupt, match="verdict"):
         gate(database, plan)
@@ -112,16 +112,14 @@ def test_a_plan_is_cleared_by_its_own_newest_feasible_playback(database: Databas
 @pytest.mark.parametrize("other", [CHECK_VERSION - 1, CHECK_VERSION + 1])
 def test_a_verdict_of_another_version_of_the_checks_opens_no_bag(database: Database, plan: Plan, other: int):
     judged(database, plan, check_version=other)
-    with pytest.raises(Conflict, match="judged by another version of the checks; play it again"):
-        gate(database, plan)
+    refused(database, plan, "judged by another version of the checks; play it again")
     judged(database, plan)
     gate(database, plan)
 
 
 def test_a_bag_without_a_hand_off_is_given_only_on_request(database: Database, plan: Plan):
     judged(database, plan)
-    with pytest.raises(Conflict, match="has no hand-off: no PSM_M, no A2"):
-        gate(database, plan, handoff=None)
+    refused(database, plan, "has no hand-off: no PSM_M, no A2", handoff=None)
     both = cases.add_plan(database, psm_m={"approach": (-0.94, 0.1, -0.33)})
     judged(database, both)
     gate(database, both, handoff=None)
@@ -130,14 +128,12 @@ def test_a_bag_without_a_hand_off_is_given_only_on_request(database: Database, p
 def test_a_motion_that_was_compared_with_no_tissue_is_not_exported(database: Database, plan: Plan):
     without = cases.add_plan(database, tissue_mm=None)
     judged(database, without)
-    with pytest.raises(Conflict, match=r"tissue: not given. Plan again with tissue_mm"):
-        gate(database, without)
+    refused(database, without, r"tissue: not given. Plan again with tissue_mm")
     assert "Tissue: not given" in describe_motion(without.about)
     box = {"frame": "PSM_base", "boxes": [{"low_mm": (90.0, 0.0, 0.0), "high_mm": (95.0, 1.0, 1.0)}]}
     obstacles = cases.add_plan(database, tissue_mm=None, scene=box)
     judged(database, obstacles)
-    with pytest.raises(Conflict, match="tissue: not given"):
-        gate(database, obstacles)
+    refused(database, obstacles, "tissue: not given")
     level = cases.add_plan(database, scene=box)
     assert level.plan.scene is not None
     assert (len(level.plan.scene.boxes), level.plan.scene.tissue.at_mm) == (1, (0.0, 0.0, -170.0))
@@ -157,14 +153,12 @@ def test_only_a_plan_that_follows_the_released_policy_is_replayed(database: Data
     judged(database, plan)
     with database.writing() as session:
         releases.withdraw(session, find_surgeon(session, "kestrel"), cases.SUTURE, "test")
-    with pytest.raises(Conflict, match="follows version 1 of the policy, and none is released"):
-        gate(database, plan)
+    refused(database, plan, "follows version 1 of the policy, and none is released")
     with database.writing() as session:
         releases.release(session, find_version(session, "kestrel", cases.SUTURE, 1), "test")
     gate(database, plan)
     cases.train(database, seed=1, release=True)
-    with pytest.raises(Conflict, match="follows version 1 of the policy, and version 2 is released"):
-        gate(database, plan)
+    refused(database, plan, "follows version 1 of the policy, and version 2 is released")
     newer = cases.add_plan(database)
     judged(database, newer)
     gate(database, newer)
@@ -177,9 +171,8 @@ def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: P
         ({"uses": ["export"]}, "does not cover training"),
         ({"uses": ["training", "export"], "until": "2001-01-01"}, "expired on 2001-01-01"),
     ):
-        commit(database, cases.agree, consent)
-        with pytest.raises(Conflict, match=words):
-            gate(database, plan)
+        cases.committed(database, cases.agree, consent)
+        refused(database, plan, words)
     with database.writing() as session:
         cases.agree(session, {"uses": ["training", "export"]})
         with pytest.raises(Conflict, match="none is released"):  # because consent to training had ended
@@ -188,8 +181,7 @@ def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: P
     gate(database, plan)
     with database.writing() as session:
         withdraw_demo(session, find_plan(session, plan.sha256).policy.demonstration.sha256, "test")
-    with pytest.raises(Conflict, match="demonstration that this plan depends on was withdrawn"):
-        gate(database, plan)
+    refused(database, plan, "demonstration that this plan depends on was withdrawn")
 
 
 def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
@@ -199,7 +191,7 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
     composed = replay.seal
 
     def withdrawn(members: dict[str, bytes]) -> bytes:
-        commit(database, cases.agree, {"uses": ["training"], "until": None})
+        cases.committed(database, cases.agree, {"uses": ["training"], "until": None})
         return composed(members)
 
     assert replay_bag(database, plan.sha256, OF_A1_ALONE)
@@ -350,8 +342,7 @@ def samples(database: Database, plan: Plan, pass_index: int | None = None) -> li
 
 
 def test_both_arms_have_a_bag_and_a_pass_alone_is_a_part_of_the_whole(database: Database):
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     half = math.radians(45) / 2
     base = {"position_mm": (160.0, 20.0, 20.0), "rotation_xyzw": (0.0, 0.0, math.sin(half), math.cos(half))}
     beside = {"approach": (-0.94, 0.10, -0.33), "base": base}

@@ -16,20 +16,20 @@ from skills.library.operation import jobs
 from skills.library.operation.jobs import BATCH
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
-from skills.library.policies import batches, retraining
+from skills.library.policies import batches, requests, retraining
 from skills.library.policies.batches import compare
 from skills.library.policies.learning import learn_style
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
 from skills.schemas.training import FitOnTheSame, PolicyFigures
 from tests.library import cases
-from tests.library.cases import commit
 from tests.library.styles import (
     NO_CONSENT,
     add_styles,
     ask_retraining,
     count_versions,
     counted,
+    finish,
     look,
     parts_of,
     retrain,
@@ -65,8 +65,7 @@ def test_all_styles_of_a_surgeon_or_of_a_suture_type_are_trained_once_each(datab
 
 
 def test_a_style_in_a_batch_is_trained_as_by_a_training_of_its_own(database: Database):
-    cases.add_demo(database)
-    alone = cases.train(database)
+    alone = cases.trained(database)
     (style,) = styles_of(database, retrain(database))
     assert (style.policy_row, count_versions(database)) == (alone.row, 1)
     other = ValueIteration()
@@ -81,15 +80,13 @@ def test_equal_requests_for_the_same_styles_are_one_job_until_one_fails(database
     assert ask_retraining(database).row == job.row
     assert ask_retraining(database, release=True).row != job.row
     assert ask_retraining(database, learner=CellQLearning()).row != job.row
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     assert ask_retraining(database).row == job.row
     cases.add_demo(database)
     more = ask_retraining(database)
     assert (more.row != job.row, more.request["styles"]) == (True, 4)
-    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
-    for part in parts_of(database, more):
-        cases.work(database, part)
+    cases.committed(database, put_surgeon, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
+    finish(database, more)
     assert look(database, more).state == "failed"
     again = ask_retraining(database)
     assert (again.row != more.row, again.state) == (True, "queued")
@@ -104,14 +101,13 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
     nothing = ask_retraining(database, only_stale=True)
     assert (nothing.state, nothing.progress, nothing.request["styles"]) == ("succeeded", 1.0, 0)
     assert ask_retraining(database, only_stale=True).row == nothing.row
-    cases.add_demo(database)
-    older = cases.train(database)
+    older = cases.trained(database)
     cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)))
     assert reasons() == [["a newer demonstration"]]
     assert reasons(learner=ValueIteration(), surgeon="kestrel") == [["other settings"]]
-    monkeypatch.setattr(retraining, "GATE_VERSION", retraining.GATE_VERSION + 1)
+    monkeypatch.setattr(requests, "GATE_VERSION", requests.GATE_VERSION + 1)
     assert reasons(surgeon="surgeon-0") == []  # an accepted version stays; for the rest see test_release_gate
-    monkeypatch.setattr(retraining, "LEARNER_VERSION", retraining.LEARNER_VERSION + 1)
+    monkeypatch.setattr(requests, "LEARNER_VERSION", requests.LEARNER_VERSION + 1)
     assert sorted(reasons()) == [["a newer learner"]] * 2 + [["other settings", "a newer learner"]]
     with database.writing() as session:  # the newest version's demonstration is gone: the one before counts again
         newest = session.scalars(select(PolicyVersion).order_by(PolicyVersion.row.desc())).first()
@@ -139,12 +135,11 @@ def test_a_cancelled_batch_stops_at_its_next_commit_and_drops_late_results(
     def learn(lesson, request, settings):
         learnt.append(lesson.row)
         if len(learnt) == 3:
-            commit(database, jobs.cancel, job.id, "test")
+            cases.committed(database, jobs.cancel, job.id, "test")
         return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batches, "learn_style", learn)
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     assert (len(learnt), count_versions(database)) == (begun, kept)
     assert states_of(database, job) == ["done"] * kept + ["cancelled"] * (8 - kept)
     batch = look(database, job)
@@ -184,7 +179,7 @@ def test_a_batch_all_of_whose_styles_were_erased_ends(database: Database):
     cases.add_demo(database)
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     cases.work(database, part)
     assert (look(database, job).state, look(database, job).result["done"]) == ("succeeded", 0)
 
@@ -224,8 +219,7 @@ def test_retraining_releases_only_on_request_and_stores_the_comparison(database:
 
 
 def test_a_worse_version_is_kept_and_not_released(database: Database):
-    cases.add_demo(database)
-    cases.train(database, release=True)
+    cases.trained(database, release=True)
     job = retrain(database, release=True, learner=CellQLearning(episodes=3))
     (style,) = styles_of(database, job)
     assert (job.state, style.state, style.policy.version) == ("succeeded", "done", 2)

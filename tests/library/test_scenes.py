@@ -27,11 +27,10 @@ from skills.library.policies import gate, releases
 from skills.library.policies.answers import roll_out
 from skills.library.policies.gate import refusals
 from skills.library.policies.retraining import request_retraining
-from skills.library.policies.training import odds_limits
 from skills.schemas.training import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
-from tests.library.styles import ask_retraining, parts_of, styles_of
+from tests.library.styles import ask_retraining, finish, styles_of
 
 SCENE = Scene(
     "PSM_base",
@@ -47,13 +46,8 @@ def trained(database, *, scene=SCENE, learner=SLIPPING, **asked):
     return cases.train(database, scene=scene.as_json(), learner=learner, **asked)
 
 
-def with_demo(database):
-    cases.add_surgeon(database)
-    return cases.add_demo(database)
-
-
 def test_a_style_is_learnt_in_a_scene_stored_and_served_with_its_odds(database):
-    with_demo(database)
+    cases.add_demo(database)
     version = trained(database, release=True, scene_costs={"touch": 60.0})
     said = version.manifest.scene
     assert said.sha256 == scene_digest(SCENE)
@@ -76,7 +70,7 @@ def test_a_style_is_learnt_in_a_scene_stored_and_served_with_its_odds(database):
 
 @pytest.mark.nightly  # by day: tests/learning/test_in_scene.py, without the store
 def test_the_stored_odds_are_those_of_many_walks_that_slip(database):
-    with_demo(database)
+    cases.add_demo(database)
     version = trained(database, learner=replace(SLIPPING, slip=0.3))
     with database.reading() as session:
         policy, odds = learnt(session.merge(version)), covered(session.merge(version))
@@ -117,7 +111,7 @@ def test_the_gate_asks_for_finishing_and_touching_and_refuses_nan(finishing, tou
 
 
 def test_a_policy_that_slips_too_often_is_stored_and_not_released(database):
-    with_demo(database)
+    cases.add_demo(database)
     job = cases.work(
         database, cases.ask_training(database, scene=SCENE.as_json(), learner=replace(SLIPPING, slip=0.6), release=True)
     )
@@ -128,7 +122,7 @@ def test_a_policy_that_slips_too_often_is_stored_and_not_released(database):
 
 
 def test_the_default_of_the_settings_is_that_of_the_gate_in_a_scene():
-    assert odds_limits(Settings()) == OddsLimits()
+    assert gate.GateLimits.of(Settings()).odds == OddsLimits()
     with pytest.raises(BadSettings, match="must be in"):
         OddsLimits(least_finishing=nan)
 
@@ -147,7 +141,7 @@ def test_the_default_of_the_settings_is_that_of_the_gate_in_a_scene():
     ],
 )
 def test_a_scene_that_cannot_be_used_is_refused_before_a_job(database, asked, error, why):
-    with_demo(database)
+    cases.add_demo(database)
     with pytest.raises(error, match=why):
         cases.ask_training(database, **{"learner": SLIPPING} | asked)
     with database.reading() as session:
@@ -155,7 +149,7 @@ def test_a_scene_that_cannot_be_used_is_refused_before_a_job(database, asked, er
 
 
 def test_another_scene_or_cost_is_another_training_and_an_equal_one_is_not(database):
-    with_demo(database)
+    cases.add_demo(database)
     given = [
         {"scene": SCENE.as_json()},
         {"scene": SCENE.as_json(), "scene_costs": {"close": 0.1}},  # the default
@@ -170,22 +164,22 @@ def test_another_scene_or_cost_is_another_training_and_an_equal_one_is_not(datab
 
 @pytest.mark.nightly  # by day a batch keeps joining rules
 def test_a_batch_keeps_the_scene_of_a_style_and_its_learner(database):
-    with_demo(database)
+    cases.add_demo(database)
     version = trained(database, release=True)
     assert [style.stale for style in styles_of(database, ask_retraining(database, only_stale=True))] == []
-    other = request_retraining(database, RetrainingIn(only_stale=True), "test", odds=OddsLimits(0.5, 0.5)).job
+    other = request_retraining(
+        database, RetrainingIn(only_stale=True), "test", gate.GateLimits(odds=OddsLimits(0.5, 0.5))
+    ).job
     assert [style.stale for style in styles_of(database, other)] == [["other limits at the near starts"]]
     job = ask_retraining(database)
-    for part in parts_of(database, job):
-        cases.work(database, part)
+    finish(database, job)
     (style,) = styles_of(database, job)
     assert style.policy.sha256 == version.sha256
     trained(database, scene_costs={"close": 0.2})  # newer, and not released
     (style,) = styles_of(database, ask_retraining(database, only_stale=True))
     assert style.stale == ["another scene"]
     named = ask_retraining(database, learner=PhaseQLearning(gamma=0.95))
-    for part in parts_of(database, named):
-        cases.work(database, part)
+    finish(database, named)
     (style,) = styles_of(database, named)
     assert style.policy.manifest.scene.scene == SCENE
     assert style.policy.manifest.learner == "phase-q-learning"
@@ -204,7 +198,7 @@ def test_a_policy_in_a_scene_has_a_digest_of_its_own_and_is_read_back():
 
 
 def test_a_scene_changed_in_the_database_is_noticed(database):
-    with_demo(database)
+    cases.add_demo(database)
     version = trained(database)
     moved = version.manifest.model_copy(update={"scene": replace(version.manifest.scene, sha256="0" * 64)})
     with database.reading() as session:

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from copy import copy
 from io import BytesIO
-from itertools import count as counted
+from itertools import count
 from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, ParsedRecording, Plan, PolicyVersion, Release, StoredPlayback, Surgeon
@@ -34,7 +34,7 @@ from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
 from tests.by_day import some
 from tests.library import cases
-from tests.library.cases import commit
+from tests.library.styles import counted
 from tests.model.replaced import Interruptible
 
 MCAP = "application/vnd.mcap"
@@ -60,11 +60,6 @@ def steps(job: Job) -> list[dict[str, Any]]:
 
 def named(job: Job, state: str) -> list[str]:
     return [one["name"] for one in steps(job) if one["state"] == state]
-
-
-def count(database: Database, table: Any) -> int:
-    with database.reading() as session:
-        return session.scalar(select(func.count()).select_from(table)) or 0
 
 
 def in_frame(frame: str) -> bytes:
@@ -107,8 +102,8 @@ def test_open_questions_end_a_try_and_nothing_is_released(database: Database) ->
             TryIn(recording=recording, surgeon="kestrel", suture=cases.SUTURE, **choice["change"])
     half = tried(database, recording, tissue_mm="none", errors="calibrated")
     assert named(half, "asks") == ["release"]
-    assert count(database, Release) == count(database, Plan) == 0
-    assert count(database, PolicyVersion) == 1  # found again, not learnt as another version
+    assert counted(database, Release) == counted(database, Plan) == 0
+    assert counted(database, PolicyVersion) == 1  # found again, not learnt as another version
 
 
 def test_of_several_hand_offs_one_is_asked_for(database: Database) -> None:
@@ -176,7 +171,7 @@ def test_a_policy_that_may_not_be_released_says_so_and_is_not(database: Database
     assert "not the arm's base" in certify["text"] and "local/measured_cp" in certify["remedies"][0]
     assert {"cell_mm": 4.0, "hysteresis": 0.0} in [choice["change"] for choice in certify["choices"]]
     assert play["text"].startswith((job.error or "")[:40])
-    assert count(database, Release) == 0
+    assert counted(database, Release) == 0
 
 
 def test_a_try_is_repeated_after_it_ended_and_not_before(database: Database) -> None:
@@ -198,12 +193,12 @@ def test_a_cancelled_try_stops_at_its_next_step(database: Database) -> None:
         job = request_try(session, TryIn(recording=recording, surgeon="kestrel", suture=cases.SUTURE), "test").job
         session.execute(update(Job).where(Job.row == job.row).values(state="cancelled"))
     assert cases.work(database, job).state == "cancelled"
-    assert count(database, Demonstration) == 0
+    assert counted(database, Demonstration) == 0
 
 
 def test_what_is_not_there_or_not_consented_is_refused_at_once(database: Database) -> None:
     recording = stored(database)
-    commit(database, cases.agree, {"uses": ["export"]}, "heron")
+    cases.committed(database, cases.agree, {"uses": ["export"]}, "heron")
     for surgeon, known, error in (
         ("nobody", recording, NotFound),
         ("kestrel", "0" * 64, NotFound),
@@ -217,8 +212,8 @@ def test_an_erased_demonstration_takes_its_tries_along(database: Database) -> No
     recording = stored(database)
     job = tried(database, recording)
     (digest,) = {one["id"] for one in steps(job) if one["name"] == "cut"}
-    commit(database, erase_demo, digest, "test")
-    assert count(database, Job) == 0
+    cases.committed(database, erase_demo, digest, "test")
+    assert counted(database, Job) == 0
 
 
 def erase_its_demo(session: Session, job: Job) -> None:
@@ -264,20 +259,20 @@ def ended_before(last: int, database: Database, job: Job, ending: Callable[[Sess
         if at == last:
             with database.writing() as session:
                 ending(session, session.get_one(Job, job.row))
-            there[:] = [count(database, one) for one in STORED]
+            there[:] = [counted(database, one) for one in STORED]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Interruptible, "pause", staticmethod(pause))
         Work(worker, Settings(database_url=database.url), perform_job).try_once(job.row, job.attempt, 0)
     if there:
-        assert [count(database, one) for one in STORED] == there, f"stored after its end before transaction {last}"
+        assert [counted(database, one) for one in STORED] == there, f"stored after its end before transaction {last}"
     return bool(there)
 
 
 def end_before_each_transaction(database: Database, ending: Callable[[Session, Job], None], **asked: Any) -> int:
     """End a try, each time of another surgeon, before each of its transactions; return the number of those."""
     recording = cases.store(database, cases.upload(cases.bag(), MCAP)).recording.sha256  # kestrel's, so that it stays
-    for last in counted(1):
+    for last in count(1):
         cases.add_surgeon(database, surgeon := f"heron-{last}")
         said = TryIn(recording=recording, surgeon=surgeon, suture=cases.SUTURE, **asked)
         add_demo(database, recording, DemoIn(surgeon=surgeon, suture=cases.SUTURE, cell_mm=asked["cell_mm"]), "test")

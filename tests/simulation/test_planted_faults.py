@@ -194,7 +194,7 @@ def databases(tmp_path: Path) -> Iterator[tuple[Database, Database]]:
 
 def played(database: Database, plan: Plan) -> StoredPlayback:
     with database.writing() as session:
-        job, _ = request_playback(session, plan.sha256, "test", Settings())
+        job, *_ = request_playback(session, plan.sha256, "test", Settings())
     job = cases.work(database, job)
     assert job.state == "succeeded", job.error
     with database.reading() as session:

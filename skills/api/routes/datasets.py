@@ -10,7 +10,6 @@ from skills.api.responses import Giving, start_job
 from skills.api.streams import stored_file
 from skills.db.service_tables import StoredDataset
 from skills.formats import BYTES
-from skills.library.operation.jobs import requested
 from skills.library.recordings import datasets
 from skills.schemas.datasets import DatasetEpisodes, DatasetIn
 
@@ -23,7 +22,7 @@ def export_dataset(body: DatasetIn, db: Db, jobs: Jobs, actor: Actor) -> Respons
 
     409 if the consent of a surgeon in it does not cover an export.
     """
-    return start_job(db, jobs, None, lambda session: requested(*datasets.request_dataset(session, body, actor)))
+    return start_job(db, jobs, None, lambda session: datasets.request_dataset(session, body, actor))
 
 
 @router.get("/datasets/{dataset}", **gives_file("reader", (BYTES, StoredDataset.media_type), 404, 409))

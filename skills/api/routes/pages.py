@@ -308,7 +308,7 @@ def show_plan(plan: Digest, page: WebPage, settings: Configured) -> Response:
             "plan.html",
             plan=found,
             played=[(one, headline_of(one.playback, settings)) for one in overview.playbacks_of(session, found)],
-            in_words=describe_motion(found.about),
+            description=describe_motion(found.about),
             hands_over=found.about.psm_m is not None,
             no_bag=None if refusal is None else refusal.words(Door.HTTP),
             job=overview.newest_job(session, "playback", plan=found.sha256),

@@ -11,7 +11,7 @@ from skills.api.responses import Giving, accepted, as_asked, start_job
 from skills.db.session import Database
 from skills.formats import BYTES
 from skills.library.operation import locks
-from skills.library.operation.jobs import RequestedJob, requested
+from skills.library.operation.jobs import RequestedJob
 from skills.library.plans import plans, playbacks
 from skills.library.plans.playback_pictures import find_pictures, request_pictures
 from skills.library.plans.playbacks import describe_playback, find_playback, shown_playback
@@ -28,7 +28,7 @@ def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configure
         surgeon = plans.find_plan(session, body.plan).policy.surgeon.slug
 
     def request(session: Session) -> RequestedJob:
-        return requested(*playbacks.request_playback(session, body.plan, actor, settings, body.arm_errors))
+        return playbacks.request_playback(session, body.plan, actor, settings, body.arm_errors)
 
     return start_job(db, jobs, [locks.surgeon(surgeon)], request)
 
@@ -88,8 +88,8 @@ def draw_pictures(playback: Digest, db: Db, actor: Actor) -> Response:
     with db.reading() as session:
         surgeon = find_playback(session, playback).plan.policy.surgeon.slug
     with db.writing([locks.surgeon(surgeon)]) as session:
-        asked = requested(*request_pictures(session, shown_playback(session, playback), actor))
-        return accepted(session, asked.job, asked.did)
+        job, _, did = request_pictures(session, shown_playback(session, playback), actor)
+        return accepted(session, job, did)
 
 
 def _drawn(db: Database, playback: str, which: Callable[[Pictures], bytes]) -> bytes:

@@ -162,7 +162,7 @@ def roll_out(surgeon: Slug, suture: Slug, body: RolloutIn, db: Db) -> Response:
 def next_action(surgeon: Slug, suture: Slug, body: NextIn, db: Db) -> Response:
     """Return the policy's next action at a position, or the next pose of the pose style at a pose; nothing moves."""
     with db.reading() as session:
-        policy = versions.policy_of(session, surgeon, suture).policy
+        policy = versions.served_release(session, surgeon, suture).policy
         if body.rotation_xyzw is not None:
             poses = poses_of(policy)
             return say(find_next(policy, poses, body.position_mm, body.rotation_xyzw, body.phase))
@@ -186,6 +186,6 @@ def _refuse_overtaken(session: Session, encoded: Encoded, surgeon: str, suture: 
     """
     if if_match is None:
         return
-    served = versions.policy_of(session, surgeon, suture)
-    if not names(if_match, encoded.policy(served.policy, served.release, JSON).etag):
+    served = versions.served_release(session, surgeon, suture)
+    if not names(if_match, encoded.policy(served.policy, served, JSON).etag):
         raise PreconditionFailed("Another policy is released now; read it, then repeat the request.")

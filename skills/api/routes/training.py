@@ -10,9 +10,10 @@ from skills.api.openapi import gives, router_of, starts_job
 from skills.api.responses import accepted, start_job
 from skills.library.operation import locks
 from skills.library.operation.jobs import PART, attempts_to_submit, count
+from skills.library.policies.gate import GateLimits
 from skills.library.policies.outcomes import describe_job, describe_styles
 from skills.library.policies.retraining import find_retraining, list_styles, request_retraining
-from skills.library.policies.training import near_limits, odds_limits, request_training
+from skills.library.policies.training import request_training
 from skills.schemas.training import Retraining, RetrainingIn, TrainingIn
 
 router = router_of("jobs")
@@ -26,9 +27,8 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, se
     the gate. `did` states the effect of the request; `result.released` and `served` state what is served now.
     """
     refuse_release(caller, body.release)
-    limits = near_limits(settings), odds_limits(settings)
-    names = [locks.surgeon(body.surgeon)]
-    return start_job(db, jobs, names, lambda session: request_training(session, body, actor, *limits))
+    limits, names = GateLimits.of(settings), [locks.surgeon(body.surgeon)]
+    return start_job(db, jobs, names, lambda session: request_training(session, body, actor, limits))
 
 
 @router.post("/retrainings", **starts_job(404, 409, 410))
@@ -39,7 +39,7 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
     ended; the new job covers only these. `did` states the effect of the request.
     """
     refuse_release(caller, body.release)
-    job, new, did = request_retraining(db, body, actor, near_limits(settings), odds_limits(settings))
+    job, new, did = request_retraining(db, body, actor, GateLimits.of(settings))
     with db.reading() as session:
         told = attempts_to_submit(session, job) if new else []
         answer = accepted(session, job, did)

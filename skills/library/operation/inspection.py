@@ -34,7 +34,7 @@ from skills.library.comparison.calibrations import read_calibration
 from skills.library.operation.history import Verified, verify_history
 from skills.library.operation.integrity import OF_DEMO, covered, demo_identity, planned, posed
 from skills.library.operation.jobs import identity_of
-from skills.library.policies.combined import path_of
+from skills.library.policies.combined import learnt_from
 from skills.library.policies.pose_styles import poses_of_demonstrations
 from skills.library.policies.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
 from skills.library.recordings.content_cache import alike, cached_content, read_entry
@@ -406,7 +406,7 @@ def _policy(row: models.PolicyVersion) -> Why:
         "its demonstration is of another style": styles != {(row.surgeon_row, row.suture)},
     }
     yield from (why for why, has_it in faults.items() if has_it)
-    if digest(row.learnt.path) != digest(path_of(row)):
+    if digest(row.learnt.path) != digest(learnt_from(row).path):
         yield "its path differs from that of its demonstration"
     covered(row)  # raises `Corrupt`
 

@@ -14,12 +14,12 @@ even if several workers train it. The batch ends in the same transaction as its 
 
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
+from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
+from pydantic import BaseModel, ConfigDict
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
-from skills.comparison.combining import Combining
 from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import ALL_ROWS
@@ -31,12 +31,14 @@ from skills.library.people.consent import require
 from skills.library.policies.releases import is_served
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
+from skills.schemas.operation import JobResult
 from skills.schemas.training import StoredComparison
 
-BATCH, PART = "retraining", "retraining-part"
+TRAINING, BATCH, PART = "training", "retraining", "retraining-part"
 EXPORT, PICTURES = "dataset", "pictures"
 ACTIVE = ("queued", "running")
-Store = Callable[[Session, str], dict[str, Any]]  # stores a result in a transaction, on behalf of this actor
+Result = TypeVar("Result", bound=JobResult)
+Store = Callable[[Session, str], Result]  # stores a result in a transaction, on behalf of this actor
 # For statements that change many rows: no object of the session has to follow, so none is searched for.
 UNSYNCHRONISED: Any = {"execution_options": {"synchronize_session": False}}
 Rows = Sequence[int] | Select[int]  # at most as many as a statement may have parameters, or a query
@@ -144,92 +146,36 @@ def _why(counted: dict[str, int]) -> str | None:
     return f"{counted['cancelled']} of {styles} styles were cancelled." if counted["cancelled"] else None
 
 
-LIVE = ("queued", "running", "succeeded")
-QUEUED = "A new job is queued."  # `RequestedJob.did` of a new job
 JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 
 
-JOIN_AS_SERVED = "as served"  # `joins` of a batch in which each style keeps the joining rule of its served policy
+class JobRequest(BaseModel):
+    """The request of a job, all defaults resolved: the base class of those of each kind.
+
+    Fields that are None are not stored, so that one which is added later changes no identity.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+    kind: ClassVar[str]
+
+    @property
+    def stored(self) -> dict[str, Any]:
+        """The plain JSON in the job's row."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    @property
+    def identity(self) -> str:
+        """The digest of the kind and of all inputs."""
+        return identity_of(self.kind, self.stored)
 
 
-class TrainingRequest(TypedDict):
-    """The request of a training's job, all defaults resolved; its digest is the identity of the training."""
-
-    surgeon: str
-    suture: str
-    demos: list[str]
-    learner: dict[str, Any]
-    learner_version: int
-    gate: int
-    poses: int
-    near: dict[str, float]  # of the gate
-    seed: int
-    release: bool
-    combine: NotRequired[dict[Literal["kind"], Combining]]  # of several demonstrations
-    outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
-    depth_along: NotRequired[list[float]]  # in a frame that is not the base of the arm
-    surroundings: NotRequired[dict[str, Any]]  # the scene and its costs
-    odds: NotRequired[dict[str, float]]  # of the gate in a scene
-
-
-class RetrainingRequest(TypedDict):
-    """The request of a batch's job: the settings that its styles share, and the digest of what they are learnt from."""
-
-    surgeon: str | None
-    suture: str | None
-    only_stale: bool
-    learner: dict[str, Any]
-    learner_version: int
-    gate: int
-    poses: int
-    near: dict[str, float]
-    odds: dict[str, float]
-    joins: str | None  # `JOIN_AS_SERVED`; None where the request names a learner
-    seed: int
-    release: bool
-    styles: NotRequired[int]
-    demos_sha256: NotRequired[str]
-    after: NotRequired[str]  # the equal batch whose styles serve something else now
-
-
-class PartRequest(TypedDict):
+class PartRequest(JobRequest):
     """The request of a part of a batch: the rows of both jobs, no personal data."""
+
+    kind: ClassVar[str] = PART
 
     retraining: int
     part: int
-
-
-class PlaybackRequest(TypedDict):
-    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under."""
-
-    plan: str
-    check_version: int
-    errors: dict[str, Any]
-    stated_by: Literal["request", "installation"]
-
-
-class PicturesRequest(TypedDict):
-    """The request of the pictures of a playback; erasing a demonstration finds the job by the plan."""
-
-    plan: str
-    playback: str
-
-
-class DatasetRequest(TypedDict):
-    """The request of an export's job: the contents of its README, and the digest of its demonstrations and splits."""
-
-    name: str
-    version: str
-    fps: int
-    arms: list[str]
-    whole: bool
-    split: str
-    licence: str
-    description: str
-    procedure: str
-    consent: str  # in words, without a pseudonym
-    episodes: int
-    demos_sha256: str
 
 
 class RequestedJob(NamedTuple):
@@ -240,35 +186,39 @@ class RequestedJob(NamedTuple):
     did: str
 
 
-def ask(
-    session: Session, kind: str, request: Mapping[str, object], surgeon: Surgeon | None, actor: str
-) -> tuple[Job, bool]:
-    """Queue work whose inputs are all resolved; return the job, and whether it is new.
+def ask(session: Session, request: JobRequest, surgeon: Surgeon | None, actor: str) -> RequestedJob:
+    """Queue work whose inputs are all resolved.
 
     An equal request that is queued, running or done returns the same job; after a failed or cancelled one a new job is
     queued.
     """
-    known = find_live(session, kind, request)
+    stored = request.stored
+    identity = identity_of(request.kind, stored)
+    known = _live(session, identity)
     if known is not None:
-        return known, False
+        return RequestedJob(known, False, did_nothing(known))
     job = Job(
         id=secrets.token_hex(8),
-        kind=kind,
-        identity=identity_of(kind, request),
-        request={**request},
-        plan=request.get("plan"),
+        kind=request.kind,
+        identity=identity,
+        request=stored,
+        plan=stored.get("plan"),
         surgeon_row=surgeon.row if surgeon else None,
         requested_by=actor,
     )
     session.add(job)
     session.flush()
-    record_event(session, actor, "ask", f"job-{kind}", job.id, surgeon)
-    return job, True
+    record_event(session, actor, "ask", f"job-{job.kind}", job.id, surgeon)
+    return RequestedJob(job, True, "A new job is queued.")
 
 
-def find_live(session: Session, kind: str, request: Mapping[str, object]) -> Job | None:
+def find_live(session: Session, request: JobRequest) -> Job | None:
     """Return the job of an equal request that is queued, running or done, even if the caller may not see it."""
-    alike = select(Job).where(Job.identity == identity_of(kind, request), Job.state.in_(LIVE))
+    return _live(session, request.identity)
+
+
+def _live(session: Session, identity: str) -> Job | None:
+    alike = select(Job).where(Job.identity == identity, Job.state.in_(("queued", "running", "succeeded")))
     # All rows, not only the caller's: an equal job must not be queued twice.
     return session.scalar(alike.execution_options(**ALL_ROWS))
 
@@ -293,9 +243,9 @@ def while_running(database: Database, row: int, attempt: int) -> Database:
     return database.on_condition(check, [locks.job(row)] if names is None else names)
 
 
-def progress_callback(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
+def progress_callback(database: Database, request: JobRequest) -> Callable[[float], None]:
     """Return a callback that stores the progress of a running job, in the database of `while_running`."""
-    mine = (Job.identity == identity_of(kind, request), Job.state == "running")
+    mine = (Job.identity == request.identity, Job.state == "running")
 
     def tell(share: float) -> None:
         with database.writing(()) as session:
@@ -307,11 +257,6 @@ def progress_callback(database: Database, kind: str, request: Mapping[str, objec
 def did_nothing(job: Job) -> str:
     """Return the sentence that a request had no effect because an equal job exists."""
     return f"Nothing: an equal job {'has succeeded' if job.state == 'succeeded' else f'is {job.state}'} already."
-
-
-def requested(job: Job, new: bool) -> RequestedJob:
-    """Return a requested job with the effect of the request: it is queued, or existed."""
-    return RequestedJob(job, new, QUEUED if new else did_nothing(job))
 
 
 def refuse_too_many(session: Session, actor: str, most: int) -> None:
@@ -330,7 +275,7 @@ def refuse_too_many(session: Session, actor: str, most: int) -> None:
 
 
 def identity_of(kind: str, request: Mapping[str, object]) -> str:
-    """Return the identity of a request: the digest of its kind and of all its inputs."""
+    """Return the identity of a request as it is stored: the digest of its kind and of all its inputs."""
     return sha256(canonical([kind, request]))
 
 
@@ -342,9 +287,9 @@ def shown() -> list[ColumnElement[bool]]:
     return [Job.kind != PART, of_job.is_(None)]
 
 
-def newest(session: Session, kind: str, request: Mapping[str, object]) -> Job | None:
+def newest(session: Session, request: JobRequest) -> Job | None:
     """Return the newest job with exactly this request, in any state."""
-    mine = select(Job).where(Job.identity == identity_of(kind, request))
+    mine = select(Job).where(Job.identity == request.identity)
     return session.scalar(mine.order_by(Job.row.desc()).limit(1))
 
 
@@ -368,11 +313,8 @@ def list_jobs(
     query = select(Job).where(*shown()).order_by(Job.row.desc()).limit(limit)
     if before is not None:
         query = query.where(Job.row < before)
-    if state is not None:
-        query = query.where(Job.state == state)
-    if kind is not None:
-        query = query.where(Job.kind == kind)
-    return session.scalars(query).all()
+    asked = {"state": state, "kind": kind}
+    return session.scalars(query.filter_by(**{name: one for name, one in asked.items() if one is not None})).all()
 
 
 def names_of(session: Session, row: int) -> list[str] | None:

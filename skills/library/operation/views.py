@@ -54,7 +54,7 @@ def view_of_version(version: PolicyVersion) -> dict[str, object]:
         every += 1
         shown = np.flatnonzero((grid.cells_of(np.arange(grid.n_states)) % every == 0).all(axis=1))
     moves = moves_to_goal(policy, coverage.reaches)
-    return _view(learnt_from(version), policy.path, sparse_reward(policy.path, policy.levels)) | {
+    return _view(learnt_from(version).demo, policy.path, sparse_reward(policy.path, policy.levels)) | {
         "version": version.version,
         "starts": {
             "every": every,

@@ -11,24 +11,23 @@ A *table* needs the columns `measured_q1` to `measured_q6` and `setpoint_q1` to 
 dVRK's `measured_js` has them. With a tracker it also has `marker_x`, `marker_y` and `marker_z`, in m; with times `t_s`.
 """
 
-import csv
 import json
 import shutil
 import tempfile
 from pathlib import Path
-from typing import get_args
+from typing import BinaryIO, get_args
 
 import numpy as np
 
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput, BadRecording, BadSettings
 from skills.formats import SUFFIXES, media_type_of, read_recording
+from skills.formats.cells import TableLayout, header_of, open_text, read_numbers
 from skills.formats.rosbag import Suffix, positions_on
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
 from skills.verification.arm_calibration import MeasuredArm
 from skills.verification.arm_errors import NAMED, SIZES, ArmErrors, checked_own
 
-MOST_ROWS = 1_000_000
 LOST_PERIODS = 3.0  # ours: between positions further apart than so many of its periods the tracker had lost the marker
 _JOINTS = tuple(f"q{number}" for number in range(1, 7))
 _NEEDED = tuple(f"{kind}_{joint}" for kind in ("measured", "setpoint") for joint in _JOINTS)
@@ -73,8 +72,8 @@ def read_measured(
         tracker: The topic of a recording with a tracker's positions of a marker on the tool; None: there is none.
 
     Raises:
-        BadInput: The table lacks a column, has a cell that is no number, or too many rows; or a tracker is named for
-            a table.
+        BadInput: The table lacks a column, has a cell that is not a finite number, no rows or too many; or a tracker is
+            named for a table.
         BadRecording: The recording cannot be used, or has no setpoints of the arm.
         OSError: The file cannot be read.
     """
@@ -83,7 +82,8 @@ def read_measured(
         if set(_NEEDED) & set(header):
             if tracker is not None:
                 raise BadInput(f"A table has the tracker's positions in {', '.join(_MARKER)}; omit the topic.")
-            return _of_table(file, instrument, rate_hz)
+            opened.seek(0)
+            return _of_table(opened, instrument, rate_hz)
         opened.seek(0)
         recording = read_recording(opened)
         kind = media_type_of(opened)
@@ -142,32 +142,25 @@ def _marker_mm(file: Path, suffix: str, tracker: str, at_ns: Ints) -> Floats:
     return found
 
 
-def _of_table(file: Path, instrument: str, rate_hz: float | None) -> MeasuredArm:
-    with file.open(newline="", encoding="utf-8") as opened:
-        rows = csv.reader(opened)
-        names = [name.strip().lower() for name in next(rows)]
+def _of_table(opened: BinaryIO, instrument: str, rate_hz: float | None) -> MeasuredArm:
+    with open_text(opened) as text:
+        names, separator = header_of(text)
+        names = [name.lower() for name in names]
         if missing := [name for name in _NEEDED if name not in names]:
             raise BadInput(f"The table has no column {missing[0]}; give {', '.join(_NEEDED)} in rad and m.")
         wanted = [name for name in (*_NEEDED, *_MARKER, "t_s") if name in names]
-        at = [names.index(name) for name in wanted]
-        cells: list[list[float]] = []
-        for number, row in enumerate(rows, start=2):
-            if len(cells) >= MOST_ROWS:
-                raise BadInput(f"The table has more than {MOST_ROWS} rows; give a part of it.")
-            try:
-                cells.append([float(row[column]) for column in at])
-            except (ValueError, IndexError):
-                raise BadInput(f"Row {number} of the table has a cell that is no number.", row=number) from None
-    columns = dict(zip(wanted, np.array(cells, np.float64).reshape(-1, len(wanted)).T, strict=True))
-    marked = set(_MARKER) <= set(columns)
+        layout = TableLayout(names, [[names.index(name)] for name in wanted], separator)
+        numbers = read_numbers(text, layout)
+    columns = {name: group[:, 0] for name, group in zip(wanted, numbers.groups, strict=True)}
     if rate_hz is not None and not 0 < rate_hz <= 10_000:
         raise BadInput("The rate must be a number of samples per second above 0, at most 10000.", rate_hz=rate_hz)
     stamps_s = columns.get("t_s")
     if stamps_s is None and rate_hz is not None:
-        stamps_s = np.arange(len(cells)) / rate_hz
+        stamps_s = np.arange(numbers.rows) / rate_hz
     (setpoint_mm, setpoint), (measured_mm, measured) = (
         forward(_joints(columns, kind), instrument) for kind in ("setpoint", "measured")
     )
+    marked = set(_MARKER) <= set(columns)
     marker_mm = np.stack([columns[name] for name in _MARKER], axis=1) * _M_TO_MM if marked else None
     return MeasuredArm(setpoint_mm, setpoint, measured_mm, measured, stamps_s, marker_mm)
 

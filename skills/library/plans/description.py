@@ -15,23 +15,14 @@ from skills.schemas.plans import PlanDescription, PlanScene, PlanSummary, Source
 
 def describe_plan(plan: SuturePlan, trajectory: Trajectory, learnt_in: Scene | None) -> PlanDescription:
     """Return the description of a plan; `learnt_in` is the scene of its policy."""
-    return PlanDescription(
-        arm=plan.arm,
-        frame=plan.frame,
-        instrument=plan.instrument,
-        orientation=plan.orientation,
-        departure=plan.departure,
+    return PlanDescription.from_attributes_of(
+        plan,
         a2=plan.a2 if plan.psm_m is not None else None,
-        path=plan.path,
         psm_m=None if plan.psm_m is None else _describe_psm_m(plan.psm_m),
-        realignment=plan.psm_m is not None,
         scene=None if plan.scene is None else _describe_scene(plan.scene, learnt_in),
-        speed_mm_s=plan.speed_mm_s,
-        tip_offset_mm=plan.tip_offset_mm,
         passes=[
-            schemas.Pass(
-                position_mm=one.point.position_mm,
-                rotation_xyzw=one.point.rotation_xyzw,
+            schemas.Pass.from_attributes_of(
+                one.point,
                 start_mm=xyz(one.start_mm),
                 states=one.states.tolist(),
                 path_mm=one.tip_mm.tolist(),
@@ -42,17 +33,14 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory, learnt_in: Scene | N
             )
             for one, transfer in zip(plan.passes, transfers(trajectory), strict=True)
         ],
-        trajectory=Timetable(
-            rate_hz=trajectory.rate_hz,
+        trajectory=Timetable.from_attributes_of(
+            trajectory,
             samples=len(trajectory),
-            duration_s=trajectory.duration_s,
             seconds_by_phase=seconds_by_phase(trajectory),
             speed_used_mm_s=trajectory.speed_mm_s,
-            tempo=trajectory.tempo,
             jaw="recorded" if all(jaw_recorded(one.hand) for one in plan.passes) else "constant",
             peak_joint_speed_ratio=trajectory.speed_ratio,
             peak_joint_acceleration_ratio=trajectory.acceleration_ratio,
-            deviation_mm=trajectory.deviation_mm,
             psm_m_moves=trajectory.psm_m is not None,
             seams=list(seams(trajectory)),
         ),
@@ -60,14 +48,8 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory, learnt_in: Scene | N
 
 
 def _describe_psm_m(psm_m: PsmM) -> schemas.PsmM:
-    return schemas.PsmM.model_construct(  # by the names of the fields: `from` is a keyword of Python
-        approach=psm_m.approach,
-        base_mm=psm_m.base_mm,
-        base_xyzw=psm_m.base_xyzw,
-        instrument=psm_m.instrument,
-        enters=psm_m.enters,
-        from_=Sources(approach=psm_m.approach_from, base=psm_m.base_from),
-    )
+    sources = Sources(approach=psm_m.approach_from, base=psm_m.base_from)
+    return schemas.PsmM.from_attributes_of(psm_m, from_=sources)
 
 
 def _describe_scene(scene: Scene, learnt_in: Scene | None) -> PlanScene:
@@ -124,7 +106,7 @@ def describe_stored(row: Plan) -> schemas.Plan:
         suture=row.policy.suture,
         policy=PolicyName.model_validate(row.policy),
         hands_over=row.about.psm_m is not None,
-        in_words=describe_motion(row.about),
+        description=describe_motion(row.about),
         created_at=row.created_at,
     )
 

@@ -26,7 +26,7 @@ from skills.library.operation import locks
 from skills.library.operation.integrity import find_by_digest, learnt, plan_identity, planned
 from skills.library.plans.description import describe_plan
 from skills.library.policies import versions
-from skills.library.policies.combined import combined_of, learnt_from
+from skills.library.policies.combined import learnt_from
 from skills.library.recordings.recordings import Reader, Upload, read_upload
 from skills.planning.handoff import PsmM
 from skills.planning.path_fit import styled
@@ -168,8 +168,8 @@ def _scene(request: PlanIn, frame: str, learnt_in: Scene | None) -> Scene | None
 
 def hand_of(version: PolicyVersion) -> Demo:
     """Return the demonstration whose hand a plan of a policy follows: of several, with that of their pose style."""
-    demo, demos = learnt_from(version), [one.demo for one in version.demonstrations]
-    return demo if combined_of(version) is None else styled(demo, demos)
+    found = learnt_from(version)
+    return found.demo if found.combined is None else styled(found.demo, [one.demo for one in version.demonstrations])
 
 
 def _refuse_metres(policy: Policy, request: PlanIn) -> None:
@@ -186,18 +186,13 @@ def _refuse_metres(policy: Policy, request: PlanIn) -> None:
     for number, start_mm in enumerate(request.starts_mm or ()):
         if start_mm is not None:
             refuse_metres(f"The start of pass {number}", start_mm, goal_mm)
-    if 0 < request.speed_mm_s < LEAST_MM:
-        raise BadSpeed(
-            f"A speed of {request.speed_mm_s:g} mm/s seems to be in metres per second.",
-            f"Give {1000 * request.speed_mm_s:g} mm/s.",
-            speed_mm_s=request.speed_mm_s,
-        )
-    if 0 < request.tip_offset_mm < LEAST_MM:
-        raise BadPlan(
-            f"A tip offset of {request.tip_offset_mm:g} mm seems to be in metres.",
-            f"Give {1000 * request.tip_offset_mm:g} mm.",
-            tip_offset_mm=request.tip_offset_mm,
-        )
+    for error, quantity, name, unit in (
+        (BadSpeed, "speed", "speed_mm_s", "mm/s"),
+        (BadPlan, "tip offset", "tip_offset_mm", "mm"),
+    ):
+        if 0 < (given := getattr(request, name)) < LEAST_MM:
+            why = f"A {quantity} of {given:g} {unit} seems to be in metres."
+            raise error(why, f"Give {1000 * given:g} {unit}.", **{name: given})
 
 
 def _takes_the_needle(request: PlanIn, partner: Partner | None) -> PsmM | None:
@@ -211,7 +206,7 @@ def _takes_the_needle(request: PlanIn, partner: Partner | None) -> PsmM | None:
         raise BadPlan(
             "handoff is 'none', but the request has psm_m, the arm that takes the needle.", "Omit one of them."
         )
-    if request.handoff == "none" or not request.realignment:
+    if request.handoff == "none":
         return None
     if request.psm_m is None and partner is None:
         raise NoHandOff(

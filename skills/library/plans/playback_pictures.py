@@ -1,7 +1,6 @@
 """The film and plots of a playback, drawn by a worker after the verdict is stored."""
 
-from collections.abc import Callable
-from typing import Any
+from typing import ClassVar
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -12,20 +11,28 @@ from skills.db.session import Database
 from skills.errors import NotDrawnYet
 from skills.fields import as_json
 from skills.library.operation import jobs
-from skills.library.operation.jobs import PICTURES, PicturesRequest
+from skills.library.operation.jobs import PICTURES, JobRequest, RequestedJob, Store
 from skills.remedies import Action, Remedy
+from skills.schemas.results import PicturesResult
 from skills.settings import Settings
 from skills.verification.playback import Pictures
 
 
-def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> tuple[Job, bool]:
-    """Queue the pictures of a stored playback; return the job, and whether it is new."""
-    return jobs.ask(session, PICTURES, _wanted(playback), playback.plan.policy.surgeon, actor)
+class PicturesRequest(JobRequest):
+    """The request of the pictures of a playback; erasing a demonstration finds the job by the plan."""
+
+    kind: ClassVar[str] = PICTURES
+
+    plan: str
+    playback: str
 
 
-def draw_pictures(
-    database: Database, request: PicturesRequest, settings: Settings
-) -> Callable[[Session, str], dict[str, Any]]:
+def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> RequestedJob:
+    """Queue the pictures of a stored playback."""
+    return jobs.ask(session, _wanted(playback), playback.plan.policy.surgeon, actor)
+
+
+def draw_pictures(database: Database, request: PicturesRequest, settings: Settings) -> Store[PicturesResult]:
     """Draw the film and plots of a playback; the returned function stores them."""
     from skills.simulation import film, pictures
 
@@ -41,14 +48,14 @@ def draw_pictures(
         clearance_png=pictures.png(pictures.draw_clearance(trajectory, measured, report)),
     )
 
-    def store(session: Session, actor: str) -> dict[str, Any]:
+    def store(session: Session, actor: str) -> PicturesResult:
         playback = _playback(session, request)
         of_playback = select(StoredPictures.row).where(StoredPictures.playback_row == playback.row)
         # A retry of the job must not store the pictures twice.
         if session.scalar(of_playback) is None:
             session.add(StoredPictures(playback_row=playback.row, drawn=drawn))
             record_event(session, actor, "draw", PICTURES, playback.sha256, playback.plan.policy.surgeon)
-        return {"playback": playback.sha256}
+        return PicturesResult(playback=playback.sha256)
 
     return store
 
@@ -67,7 +74,7 @@ def find_pictures(session: Session, playback: StoredPlayback) -> Pictures:
 
 def job_of_pictures(session: Session, playback: StoredPlayback) -> Job | None:
     """Return the newest job that draws the pictures of a playback, or failed to."""
-    return jobs.newest(session, PICTURES, _wanted(playback))
+    return jobs.newest(session, _wanted(playback))
 
 
 def _not_drawn(playback: StoredPlayback, job: Job | None) -> NotDrawnYet:
@@ -81,8 +88,8 @@ def _not_drawn(playback: StoredPlayback, job: Job | None) -> NotDrawnYet:
 
 
 def _wanted(playback: StoredPlayback) -> PicturesRequest:
-    return {"plan": playback.plan.sha256, "playback": playback.sha256}
+    return PicturesRequest(plan=playback.plan.sha256, playback=playback.sha256)
 
 
 def _playback(session: Session, request: PicturesRequest) -> StoredPlayback:
-    return session.scalars(select(StoredPlayback).where(StoredPlayback.sha256 == request["playback"])).one()
+    return session.scalars(select(StoredPlayback).where(StoredPlayback.sha256 == request.playback)).one()

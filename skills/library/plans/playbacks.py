@@ -6,20 +6,18 @@ A plan may be played even if its policy was withdrawn since: a verdict moves no 
 current state of the policy's release, and it is the replay bag that is refused for a policy that is not released.
 """
 
-from collections.abc import Callable
-from dataclasses import asdict
-from typing import Any
+from typing import ClassVar, Literal
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.db.models import StoredPlayback
 from skills.db.packed import digest
-from skills.db.service_tables import Job, record_event
+from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest, learnt, planned
-from skills.library.operation.jobs import PlaybackRequest
+from skills.library.operation.jobs import JobRequest, RequestedJob, Store
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.plans.headline import CHECK_VERSION, headline
 from skills.library.plans.plans import check_frame, find_plan, hand_of, trajectory_of
@@ -28,15 +26,27 @@ from skills.library.policies import releases, versions
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
 from skills.schemas.playbacks import FollowedPolicy, Headline, PictureLinks, Playback, Verdict, finite
+from skills.schemas.results import PlaybackResult
 from skills.settings import Settings
 from skills.verification.arm_errors import ArmErrors
 from skills.verification.verdict import judge_plan
 
 
+class PlaybackRequest(JobRequest):
+    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under."""
+
+    kind: ClassVar[str] = "playback"
+
+    plan: str
+    check_version: int
+    errors: ArmErrors
+    stated_by: Literal["request", "installation"]
+
+
 def request_playback(
     session: Session, plan_sha256: str, actor: str, settings: Settings, errors: ArmErrors | None = None
-) -> tuple[Job, bool]:
-    """Queue the playback of a plan in the simulator; return the job, and whether it is new.
+) -> RequestedJob:
+    """Queue the playback of a plan in the simulator.
 
     Args:
         session: The caller's transaction.
@@ -53,22 +63,20 @@ def request_playback(
     versions.followable(plan.policy)
     check_frame(plan.about.frame)
     request = playback_request(plan.sha256, settings, errors)
-    return jobs.ask(session, "playback", request, plan.policy.surgeon, actor)
+    return jobs.ask(session, request, plan.policy.surgeon, actor)
 
 
 def playback_request(plan_sha256: str, settings: Settings, errors: ArmErrors | None) -> PlaybackRequest:
     """Return the request of a playback's job, all defaults resolved; the arguments are those of `request_playback`."""
-    return {
-        "plan": plan_sha256,
-        "check_version": CHECK_VERSION,
-        "errors": asdict(stated_errors(settings.arm_errors) if errors is None else errors),
-        "stated_by": "installation" if errors is None else "request",
-    }
+    return PlaybackRequest(
+        plan=plan_sha256,
+        check_version=CHECK_VERSION,
+        errors=stated_errors(settings.arm_errors) if errors is None else errors,
+        stated_by="installation" if errors is None else "request",
+    )
 
 
-def check_playback(
-    database: Database, request: PlaybackRequest, settings: Settings
-) -> Callable[[Session, str], dict[str, Any]]:
+def check_playback(database: Database, request: PlaybackRequest, settings: Settings) -> Store[PlaybackResult]:
     """Play a plan in the simulator, judge it, and estimate its probability of success by Monte Carlo.
 
     The returned function stores all of it.
@@ -76,35 +84,34 @@ def check_playback(
     from skills.simulation.player import play
 
     with database.reading() as session:
-        stored = find_plan(session, request["plan"])
+        stored = find_plan(session, request.plan)
         plan, policy = planned(stored), PolicyName.model_validate(stored.policy)
         followed, demo = learnt(stored.policy), hand_of(stored.policy)
     check_frame(plan.frame)
     trajectory = trajectory_of(plan)
     measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
-    errors = ArmErrors(**request["errors"])
-    verdict = judge_plan(plan, trajectory, measured, policy=followed, demo=demo, errors=errors)
+    verdict = judge_plan(plan, trajectory, measured, policy=followed, demo=demo, errors=request.errors)
     report = finite(
         Verdict(
             **vars(verdict.report),
             estimate=verdict.success,
-            stated_by=request["stated_by"],
-            check_version=request["check_version"],
+            stated_by=request.stated_by,
+            check_version=request.check_version,
             failure_sentence=verdict.failure_sentence,
             scene=verdict.scene,
             tissue="not given" if plan.scene is None or plan.scene.tissue is None else "judged",
-            plan=request["plan"],
+            plan=request.plan,
             trajectory=digest(trajectory),
             policy=policy,
             frame=plan.frame,
         )
     )
 
-    def store(session: Session, actor: str) -> dict[str, Any]:
+    def store(session: Session, actor: str) -> PlaybackResult:
         # A retry of the job computes the same report and digest, and must not store it twice.
         known = session.scalar(select(StoredPlayback).where(StoredPlayback.sha256 == report.identity))
         if known is None:
-            plan = find_plan(session, request["plan"])
+            plan = find_plan(session, request.plan)
             known = StoredPlayback(
                 sha256=report.identity, plan=plan, feasible=report.feasible, report=report, measured=measured
             )
@@ -112,7 +119,7 @@ def check_playback(
             record_event(session, actor, "play", "playback", report.identity, plan.policy.surgeon)
             session.flush()
             request_pictures(session, known, actor)
-        return {"playback": known.sha256, "feasible": known.feasible}
+        return PlaybackResult(playback=known.sha256, feasible=known.feasible)
 
     return store
 
@@ -145,13 +152,11 @@ def describe_playback(session: Session, row: StoredPlayback, settings: Settings)
     All of its pictures but the first are drawn after the verdict.
     """
     here, policy = f"/playbacks/{row.sha256}", row.plan.policy
-    return Playback(
+    return Playback.from_attributes_of(
+        row,
         id=row.sha256,
-        sha256=row.sha256,
         plan=row.plan.sha256,
-        feasible=row.feasible,
         headline=headline_of(row, settings),
-        report=row.report,
         picture=f"{here}/picture.png",
         pictures=PictureLinks(
             picture=f"{here}/picture.png",
@@ -160,6 +165,5 @@ def describe_playback(session: Session, row: StoredPlayback, settings: Settings)
             joints=f"{here}/joints.png",
             clearance=f"{here}/clearance.png",
         ),
-        created_at=row.created_at,
         policy=FollowedPolicy(version=policy.version, sha256=policy.sha256, released=releases.serves(session, policy)),
     )

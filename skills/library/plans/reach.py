@@ -51,7 +51,7 @@ def map_style(database: Database, request: ReachIn) -> Reach:
         counts=(x, y, z),
         rotations=rotations,
         places=found,
-        in_words=describe_reach(found),
+        description=describe_reach(found),
     )
 
 

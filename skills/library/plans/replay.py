@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from skills.db.models import Plan, PolicyVersion, StoredPlayback
+from skills.db.models import Plan, StoredPlayback
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import Corrupt
@@ -74,11 +74,11 @@ def replay_bag(
         row = find_plan(session, plan_sha256)
         plan, policy = planned(row), row.policy
         verdict = cleared(session, row, plan, conditions)
-        partner, jaw_rad = (demo := learnt_from(policy)).partner, demo.jaw_rad
+        partner, jaw_rad = (demo := learnt_from(policy).demo).partner, demo.jaw_rad
         trajectory, report = verdict.measured.trajectory, verdict.report
         # From its verified value, and not the description stored with it.
         about = describe_plan(plan, trajectory, learnt_in(policy))
-        papers = {PLAN: _plan(row, about), VERDICT: _verdict(row, verdict), POLICY: _policy(policy)}
+        papers = _papers(row, about, verdict)
         rows = (("plans", row.row), ("playbacks", verdict.row), ("policy_versions", policy.row))
     if digest(trajectory) != report.trajectory:
         raise Corrupt("A stored motion is not the one that its verdict judged; restore it from a backup.")
@@ -90,11 +90,10 @@ def replay_bag(
         jaw_rad=held_jaw_rad(jaw_rad, plan.instrument),
         pass_index=pass_index,
     )
+    times = pass_times(trajectory, arms)
+    timetable = ExecutorTimetable(plan=row.sha256, use=USE, before_each_pass=BY_HAND, passes=times)
+    papers[EXECUTOR] = timetable.model_dump()
     members = {name: _written(paper) for name, paper in papers.items()}
-    timetable = ExecutorTimetable(
-        plan=row.sha256, use=USE, before_each_pass=BY_HAND, passes=pass_times(trajectory, arms)
-    )
-    members[EXECUTOR] = _written(timetable.model_dump())
     head = proofs.head_over(database, rows)
     members[README] = _readme(row, about, report, arms, head).encode()
     for arm in arms:
@@ -118,35 +117,20 @@ def replay_bag(
 # ---- the documents in the bag -----------------------------------------------------------------------------------
 
 
-def _plan(row: Plan, about: PlanDescription) -> dict[str, Any]:
+def _papers(row: Plan, about: PlanDescription, played: StoredPlayback) -> dict[str, dict[str, Any]]:
+    """Return the plan, its verdict, and its policy's verified manifest with the limits of its use."""
     policy = row.policy
-    return {
-        "use": USE,
-        "sha256": row.sha256,
-        "surgeon": policy.surgeon.slug,
-        "suture": policy.suture,
-        "policy": {"version": policy.version, "sha256": policy.sha256},
-        **about.model_dump(mode="json"),
-        "in_words": describe_motion(about),
-    }
-
-
-def _verdict(row: Plan, played: StoredPlayback) -> dict[str, Any]:
-    return {
-        "use": USE,
-        "sha256": played.sha256,
-        "plan": row.sha256,
-        "policy": row.policy.sha256,
-        "feasible": played.feasible,
-        "report": TypeAdapter(Verdict).dump_python(played.report, mode="json"),  # of which its digest is
-    }
-
-
-def _policy(policy: PolicyVersion) -> dict[str, Any]:
-    """Return the policy's verified manifest with the limits of its use."""
     learnt(policy)
-    name = {"use": USE, "limits": LIMITS, "version": policy.version, "sha256": policy.sha256}
-    return name | policy.manifest.model_dump(mode="json")
+    named = {"version": policy.version, "sha256": policy.sha256}
+    style = {"surgeon": policy.surgeon.slug, "suture": policy.suture, "policy": named}
+    plan = {"sha256": row.sha256, "description": describe_motion(about), **about.model_dump(mode="json")}
+    report = TypeAdapter(Verdict).dump_python(played.report, mode="json")  # of which its digest is
+    verdict = {"sha256": played.sha256, "plan": row.sha256, "policy": policy.sha256, "feasible": played.feasible}
+    return {
+        PLAN: {"use": USE, **style, **plan},
+        VERDICT: {"use": USE, **verdict, "report": report},
+        POLICY: {"use": USE, "limits": LIMITS, **named, **policy.manifest.model_dump(mode="json")},
+    }
 
 
 def _written(paper: dict[str, Any]) -> bytes:

@@ -17,8 +17,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from math import ceil
-from typing import Any
+from typing import ClassVar
 
+from pydantic import JsonValue
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
@@ -32,7 +33,7 @@ from skills.formats.parsed import ParsedContent
 from skills.gridworld import paper
 from skills.gridworld.grid import PathReport, choose_grid, describe_path, discretize
 from skills.library.operation import jobs, locks
-from skills.library.operation.jobs import RequestedJob, Store, identity_of
+from skills.library.operation.jobs import JobRequest, RequestedJob, Store
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
@@ -45,15 +46,16 @@ from skills.library.plans.playbacks import (
     playback_request,
 )
 from skills.library.policies import releases
-from skills.library.policies.gate import join_reasons, remedy
-from skills.library.policies.learning import learn_style, lessons, store_style, with_partners
-from skills.library.policies.training import near_limits, odds_limits, training_request
-from skills.library.recordings.demos import add_demo, find_demo
+from skills.library.policies.gate import GateLimits, join_reasons, remedy
+from skills.library.policies.training import train_style, training_request
+from skills.library.policies.versions import find_by_digest
+from skills.library.recordings.demos import add_demo
 from skills.library.recordings.parts import choose_part
 from skills.library.recordings.recordings import Parser, confined_reader, find_recording, stored_recording
 from skills.remedies import Remedy
 from skills.schemas.demos import DemoIn
 from skills.schemas.plans import PlanIn, SuturePointIn
+from skills.schemas.results import TryResult
 from skills.schemas.training import TrainingIn
 from skills.schemas.tries import Choice, StepName, TryIn, TryStep
 from skills.settings import Settings
@@ -63,6 +65,14 @@ TRY = "try"
 CELLS_MM = (paper.CELL_MM, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)  # ours, from the paper's to what a recording can resolve
 MOST_CHOICES = 20
 STEPS = 10  # of a try that is not stopped, for its progress
+
+
+class TryRequest(JobRequest, TryIn):
+    """The request of a try's job; `again` is unique to a try that is repeated after its end."""
+
+    kind: ClassVar[str] = TRY
+
+    again: str | None = None
 
 
 def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
@@ -76,36 +86,36 @@ def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
     require(surgeon, "training")
     recording = find_recording(session, asked.recording).sha256  # in full: the argument may be a prefix
     find_suture_type(session, asked.suture)
-    request = asked.model_dump(mode="json", exclude_none=True) | {"recording": recording}
-    known = jobs.find_live(session, TRY, request)
+    request = TryRequest(**dict(asked) | {"recording": recording})
+    known = jobs.find_live(session, request)
     if known is not None and known.state == "succeeded":
         # What it reported may have been withdrawn or erased since, so it is tried again, not looked up.
-        request["again"] = secrets.token_hex(8)
-    job, new = jobs.ask(session, TRY, request, surgeon, actor)
-    return jobs.requested(job, new)
+        request = request.model_copy(update={"again": secrets.token_hex(8)})
+    return jobs.ask(session, request, surgeon, actor)
 
 
-def perform_try(database: Database, request: dict[str, Any], settings: Settings) -> Store:
+def perform_try(database: Database, request: TryRequest, settings: Settings) -> Store[TryResult]:
     """Carry out a try, and write each of its steps into the running job's result.
 
     Raises:
         SkillsError: A step was refused; the job's result has the steps up to it.
     """
-    asked = TryIn.model_validate({name: value for name, value in request.items() if name != "again"})
-    mine = Job.identity == identity_of(TRY, request), Job.state == "running"
+    mine = Job.identity == request.identity, Job.state == "running"
     with database.reading() as session:
         actor = session.scalar(select(Job.requested_by).where(*mine)) or ""
-    told: list[dict[str, Any]] = []
+    so_far = TryResult()
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if the recording is not cached
-        for step in try_recording(database, asked, actor, settings, reader.parse):
-            told.append(step.model_dump(mode="json"))
+        for step in try_recording(database, request, actor, settings, reader.parse):
+            so_far = TryResult(steps=(*so_far.steps, step))
+            progress = min(len(so_far.steps) / STEPS, 0.95)
             with database.writing(()) as session:
-                so_far = {"result": {"steps": told}, "progress": min(len(told) / STEPS, 0.95)}
-                session.execute(update(Job).where(*mine).values(**so_far))
+                session.execute(
+                    update(Job).where(*mine).values(result=so_far.model_dump(mode="json"), progress=progress)
+                )
 
-    def store(_session: Session, _actor: str) -> dict[str, Any]:
-        return {"steps": told}
+    def store(_session: Session, _actor: str) -> TryResult:
+        return so_far
 
     return store
 
@@ -129,15 +139,15 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
     others: list[Choice] = []
     try:
         told = stored_recording(database, asked.recording, read)
-        yield _done("read", _read_in_words(told))
+        yield _done("read", _describe_recording(told))
         at = "propose"
         others = _other_parts(told.proposed, asked.segment)
         if asked.segment is None and len(told.proposed) > 1:
-            yield TryStep(name="propose", state="asks", text=_proposed_in_words(told.proposed), choices=tuple(others))
+            yield TryStep(name="propose", state="asks", text=_describe_proposed(told.proposed), choices=tuple(others))
             return
         cut = DemoIn(surgeon=asked.surgeon, suture=asked.suture, segment=asked.segment)
         part, which, because = choose_part(told, cut)
-        yield _done("propose", f"{_proposed_in_words(told.proposed)} Taken: {which}; {because}.")
+        yield _done("propose", f"{_describe_proposed(told.proposed)} Taken: {which}; {because}.")
         at = "cut"
         demo = cut_demo(told.recording, arm=part.arm, topic=part.topic, start_s=part.start_s, end_s=part.end_s)
         chosen, measured = choose_cells(demo, asked)
@@ -147,14 +157,13 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         yield _done("cut", chosen.because, added.sha256)
         yield _done("report", " ".join(added.report.advice) or "Nothing to improve in the recording.")
         at = "train"
-        version, trained = _learn(database, asked, added.sha256, settings, read)
+        version, trained = _learn(database, asked, added.sha256, actor, settings)
         yield trained
         at = "certify"
         certified = _certified(version, others)
         yield certified
         passes = certified.state == "done"
-        questions = [*_questions(asked, passes)]
-        if questions:
+        if questions := _questions(asked, passes):
             yield from questions
             return
         yield _release(database, version, actor, settings, wanted=asked.release is True, passes=passes)
@@ -162,9 +171,7 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         plan, words = _plan(database, asked, version, actor)
         yield _done("plan", words, plan)
         at = "play"
-        playback, words = _play(database, asked, plan, actor, settings)
-        yield _done("play", words, playback)
-        yield _verdict(database, asked, playback, settings, others)
+        yield from _play(database, asked, plan, actor, settings, others)
     except SkillsError as refused:
         if isinstance(least_mm := refused.numbers.get("least_mm"), float):
             reached_mm = ceil(10 * least_mm) / 10
@@ -267,7 +274,7 @@ def _refused(name: StepName, refused: SkillsError, others: Sequence[Choice]) -> 
     return TryStep(name=name, state="refused", text=refused.message, choices=tuple(others), remedies=remedies)
 
 
-def _read_in_words(parsed: ParsedContent) -> str:
+def _describe_recording(parsed: ParsedContent) -> str:
     about = parsed.about
     motions = "; ".join(
         f"{one.arm} in {one.frame}, {one.samples} samples at {quality.rate_hz:.0f} Hz"
@@ -276,7 +283,7 @@ def _read_in_words(parsed: ParsedContent) -> str:
     return f"A recording of {about.duration_s:.1f} s ({parsed.recording.format}): {motions}."
 
 
-def _proposed_in_words(proposed: Sequence[Segment]) -> str:
+def _describe_proposed(proposed: Sequence[Segment]) -> str:
     if not proposed:
         return "No hand-off is proposed."
     return "1 hand-off is proposed." if len(proposed) == 1 else f"{len(proposed)} hand-offs are proposed."
@@ -299,35 +306,35 @@ def _other_parts(proposed: Sequence[Segment], taken: int | str | None) -> list[C
 def _finer(chosen: Cells, measured: Sequence[Cells]) -> list[Choice]:
     """Return the next finer cells, and the hysteresis where there is none, as choices after a refusal."""
     after = [one for one in measured if one.cell_mm < chosen.cell_mm][:2]
-    found = [Choice(words=f"use {one.named} (they lose {one.loss_mm:.2f} mm)", change=_change(one)) for one in after]
+    found = [
+        Choice(
+            words=f"use {one.named} (they lose {one.loss_mm:.2f} mm)",
+            change={"cell_mm": one.cell_mm, "hysteresis": one.hysteresis},
+        )
+        for one in after
+    ]
     if not chosen.hysteresis:
         found.append(Choice(words="use hysteresis 0.25", change={"hysteresis": 0.25}))
     return found
 
 
-def _change(cells: Cells) -> dict[str, Any]:
-    return {"cell_mm": cells.cell_mm, "hysteresis": cells.hysteresis}
-
-
 def _learn(
-    database: Database, asked: TryIn, demo: str, settings: Settings, read: Parser
+    database: Database, asked: TryIn, demo: str, actor: str, settings: Settings
 ) -> tuple[PolicyVersion, TryStep]:
     """Learn and certify a style from a demonstration and store it; return its version, and the step."""
+    training = TrainingIn(surgeon=asked.surgeon, suture=asked.suture, demos=[demo])
     with database.reading() as session:
-        training = TrainingIn(surgeon=asked.surgeon, suture=asked.suture, demos=[demo])
-        request, _ = training_request(session, training, near_limits(settings), odds_limits(settings))
-        found = lessons(session, [find_demo(session, demo).row])
-    (lesson,) = with_partners(database, found, read)
-    made = learn_style(lesson, request, settings)
+        request, _ = training_request(session, training, GateLimits.of(settings))
+    store = train_style(database, request, settings)
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
-        version = session.get_one(PolicyVersion, store_style(session, made).row)
+        version = find_by_digest(session, store(session, actor).sha256)
         assert version.surgeon.slug == asked.surgeon  # loaded here, for the time after the session
-    metrics = made.manifest.metrics
+    metrics = version.manifest.metrics
     text = (
-        f"Version {version.version} by {made.manifest.learner}: it reproduces {metrics.exact_states} of "
+        f"Version {version.version} by {version.manifest.learner}: it reproduces {metrics.exact_states} of "
         f"{metrics.path_states} states of the demonstration, DTW {metrics.dtw_total_mm:g} mm."
     )
-    return version, _done("train", text, made.sha256)
+    return version, _done("train", text, version.sha256)
 
 
 def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:
@@ -354,26 +361,36 @@ def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:
     )
 
 
-def _questions(asked: TryIn, passes: bool) -> Iterator[TryStep]:
-    """Yield a step for each question that the request leaves open after the certificate."""
-    if asked.tissue_mm is None:
-        unknown = Choice(words="plan without tissue; the motion is then not exported", change={"tissue_mm": "none"})
-        text = "How high is the tissue, along z of the arm's frame, in mm?"
-        yield TryStep(name="tissue", state="asks", text=text, choices=(unknown,))
-    if asked.errors is None:
-        named = (
-            ("calibrated", "errors of a calibrated arm (docs/errors.md)"),
-            ("uncalibrated", "errors of an arm as it is delivered"),
-        )
-        choices = tuple(Choice(words=words, change={"errors": name}) for name, words in named)
-        yield TryStep(name="errors", state="asks", text="With which errors of the arms is it judged?", choices=choices)
-    if asked.release is None and passes:
-        text = "Release this version, so that it is served? Research use only."
-        yes, no = (
-            Choice(words="release it", change={"release": True}),
-            Choice(words="do not", change={"release": False}),
-        )
-        yield TryStep(name="release", state="asks", text=text, choices=(yes, no))
+def _asks(name: StepName, text: str, *choices: tuple[str, dict[str, JsonValue]]) -> TryStep:
+    chosen = tuple(Choice(words=words, change=change) for words, change in choices)
+    return TryStep(name=name, state="asks", text=text, choices=chosen)
+
+
+QUESTIONS = (
+    _asks(
+        "tissue",
+        "How high is the tissue, along z of the arm's frame, in mm?",
+        ("plan without tissue; the motion is then not exported", {"tissue_mm": "none"}),
+    ),
+    _asks(
+        "errors",
+        "With which errors of the arms is it judged?",
+        ("errors of a calibrated arm (docs/errors.md)", {"errors": "calibrated"}),
+        ("errors of an arm as it is delivered", {"errors": "uncalibrated"}),
+    ),
+    _asks(
+        "release",
+        "Release this version, so that it is served? Research use only.",
+        ("release it", {"release": True}),
+        ("do not", {"release": False}),
+    ),
+)
+
+
+def _questions(asked: TryIn, passes: bool) -> list[TryStep]:
+    """Return a step for each question that the request leaves open after the certificate."""
+    given = {"tissue": asked.tissue_mm, "errors": asked.errors, "release": asked.release if passes else False}
+    return [one for one in QUESTIONS if given[one.name] is None]
 
 
 def _release(
@@ -415,40 +432,29 @@ def _plan(database: Database, asked: TryIn, version: PolicyVersion, actor: str) 
     )
 
 
-def _play(database: Database, asked: TryIn, plan: str, actor: str, settings: Settings) -> tuple[str, str]:
-    """Play a plan in the simulator; return the playback's digest, and the step in words."""
+def _play(
+    database: Database, asked: TryIn, plan: str, actor: str, settings: Settings, others: Sequence[Choice]
+) -> Iterator[TryStep]:
+    """Play a plan in the simulator; yield the step of the playback, and that of the verdict."""
     store = check_playback(database, playback_request(plan, settings, asked.arm_errors), settings)
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
-        playback = store(session, actor)["playback"]
+        playback = store(session, actor).playback
     with database.reading() as session:
         row = find_playback(session, playback)
-    errors = row.report.estimate.under[0].errors.name
-    words = f"{row.report.samples} samples in the simulator, and 1000 worlds with {describe_errors(errors)}."
-    return playback, words
-
-
-def _verdict(database: Database, asked: TryIn, playback: str, settings: Settings, others: Sequence[Choice]) -> TryStep:
-    with database.reading() as session:
-        row = find_playback(session, playback)
-        line, failure = headline_of(row, settings), row.report.failure
+        line, report = headline_of(row, settings), row.report
         lowest_mm = min(z for one in row.plan.about.passes for _, _, z in one.path_mm)
-    choices: list[Choice] = []
-    remedies: list[str] = []
-    if line.level == "bad" and failure is None and asked.errors == "uncalibrated":
+    errors = describe_errors(report.estimate.under[0].errors.name)
+    yield _done("play", f"{report.samples} samples in the simulator, and 1000 worlds with {errors}.", playback)
+    verdict = _done("verdict", line.text, playback)
+    if line.level == "bad" and report.failure is None and asked.errors == "uncalibrated":
         words = "judge it with the errors of a calibrated arm, if yours is one"
-        choices.append(Choice(words=words, change={"errors": "calibrated"}))
-    elif failure is not None and failure.quantity == SCENE:
-        remedies.append(
+        others = [Choice(words=words, change={"errors": "calibrated"})]
+    elif report.failure is None:
+        others = ()
+    elif report.failure.quantity == SCENE:
+        measure = (
             f"Measure the tissue again: it is stated at {asked.tissue_mm} mm, and the tip goes down to {lowest_mm:.1f} "
             "mm. Or record the hand-off further above it."
         )
-    elif failure is not None:
-        choices += others
-    return TryStep(
-        name="verdict",
-        state="done",
-        text=line.text,
-        choices=tuple(choices),
-        remedies=tuple(remedies),
-        id=playback,
-    )
+        others, verdict = (), verdict.model_copy(update={"remedies": (measure,)})
+    yield verdict.model_copy(update={"choices": tuple(others)})

@@ -10,45 +10,36 @@ several workers would leave no room for others.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
 from threading import RLock
 from time import monotonic
-from typing import Any, cast
+from typing import Any
 
-from sqlalchemy import Table, bindparam, select, union_all, update
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from skills.comparison.combining import Combining
 from skills.db import now
-from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release, Surgeon
+from skills.db.models import PolicyDemonstration, PolicyVersion, Surgeon
 from skills.db.packed import unpack_as
 from skills.db.service_tables import LONGEST_REASON, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Busy, Conflict, SkillsError
 from skills.learning.policy import Policy
 from skills.library.operation import integrity, jobs, locks
-from skills.library.operation.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
+from skills.library.operation.jobs import UNSYNCHRONISED, PartRequest, Store
 from skills.library.people.consent import refusal
-from skills.library.policies import releases
+from skills.library.policies import learning, releases
 from skills.library.policies.combined import refuse_unlike
 from skills.library.policies.fit import compare_paths, format_mm, not_worse, policy_path, reference_paths
-from skills.library.policies.learning import (
-    Learnt,
-    Lesson,
-    Stored,
-    combined_lesson,
-    learn_style,
-    lessons,
-    store_styles,
-    with_partners,
-)
-from skills.library.policies.served_settings import ServedSettings, learner_for, settings_of_served
+from skills.library.policies.learning import Learnt, Lesson, Stored, combined_lesson, learn_style, lessons
+from skills.library.policies.requests import RetrainingRequest, TrainingRequest, requests_of_served
 from skills.library.recordings.demos import newest_demos
 from skills.library.recordings.recordings import Parser, confined_reader
+from skills.schemas.operation import JobResult
 from skills.schemas.policies import PolicyManifest
 from skills.schemas.training import FitOnTheSame, PolicyFigures, StoredComparison
 from skills.settings import Settings
@@ -56,59 +47,6 @@ from skills.settings import Settings
 TOGETHER = 25  # styles
 TOGETHER_S = 0.5  # the longest time that a result waits for the next one, and that a cancelled batch continues
 NEARLY_ONE = 1 - 1e-9  # the sum of all progress steps, below 1 so that rounding cannot exceed 1
-
-# Statements executed for every style, built once: building one takes as long as executing it.
-_STYLES, _JOBS, _DEMOS, _VERSIONS, _SURGEONS, _OTHERS = (
-    cast(Table, one.__table__)
-    for one in (StyleToRetrain, Job, Demonstration, PolicyVersion, Surgeon, PolicyDemonstration)
-)
-CONSENT = (
-    select(_DEMOS.c.row, _SURGEONS.c.slug, _SURGEONS.c.consent)
-    .join_from(_DEMOS, _SURGEONS, _SURGEONS.c.row == _DEMOS.c.surgeon_row)
-    .where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
-)
-RESTS_ON = union_all(
-    select(_VERSIONS.c.row, _VERSIONS.c.demonstration_row).where(
-        _VERSIONS.c.row.in_(bindparam("policies", expanding=True))
-    ),
-    select(_OTHERS.c.policy_row, _OTHERS.c.demonstration_row).where(
-        _OTHERS.c.policy_row.in_(bindparam("policies", expanding=True))
-    ),
-)
-QUEUED = select(_STYLES.c.row).where(
-    _STYLES.c.row.in_(bindparam("styles", expanding=True)), _STYLES.c.state == "queued"
-)
-BEGIN = update(_STYLES).where(_STYLES.c.row == bindparam("style")).values(tries=_STYLES.c.tries + 1)
-OUTCOME = (
-    update(_STYLES)
-    .where(_STYLES.c.row == bindparam("style"))
-    .values(
-        state=bindparam("became"),
-        policy_row=bindparam("policy"),
-        reason=bindparam("why"),
-        comparison=bindparam("compared", type_=_STYLES.c.comparison.type),
-        ended_at=bindparam("now"),
-    )
-)
-RUNNING = (
-    update(_JOBS)
-    .where(_JOBS.c.row == bindparam("batch"), _JOBS.c.state == "queued")
-    .values(state="running", started_at=bindparam("now"))
-)
-FURTHER = update(_JOBS).where(_JOBS.c.row == bindparam("batch")).values(progress=_JOBS.c.progress + bindparam("step"))
-_NEWEST = (
-    select(Release.policy_row)
-    .where(Release.surgeon_row == _DEMOS.c.surgeon_row, Release.suture == _DEMOS.c.suture)
-    .where(Release.withdrawn_at.is_(None))
-    .order_by(Release.row.desc())
-    .limit(1)
-    .scalar_subquery()
-)
-SERVED = (
-    select(_DEMOS.c.row, _NEWEST.label("policy"), _VERSIONS.c.version, _VERSIONS.c.sha256, _VERSIONS.c.manifest)
-    .select_from(_DEMOS.join(_VERSIONS, _VERSIONS.c.row == _NEWEST))
-    .where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
-)
 
 log = logging.getLogger(__name__)
 
@@ -122,16 +60,17 @@ AT_WORK = RLock()
 class _Style:
     """A queued style of a part: its lesson, and the number of times that it was started.
 
-    `served` are the settings of the policy that it serves, which the new one keeps; None: it serves none.
+    `served` is the request of the policy that it serves, whose settings the new one keeps; None: it serves none.
     """
 
     row: int
     tries: int
     lesson: Lesson
-    served: ServedSettings | None
+    served: TrainingRequest | None
 
 
 _Group = Sequence[_Style]  # started in one transaction, trained one after another
+_Ended = tuple[_Style, Learnt | SkillsError]
 
 
 @dataclass(frozen=True)
@@ -145,29 +84,8 @@ class _Batch:
     settings: Settings
     parse: Parser
 
-    def training_of(self, style: _Style, demos: Sequence[str], how: Combining | None = None) -> TrainingRequest:
-        """Return the request for one style as `request_training` writes it, so that an equal training is recognised."""
-        shared, lesson = self.request, style.lesson
-        request: TrainingRequest = {
-            "surgeon": lesson.surgeon.slug,
-            "suture": lesson.suture,
-            "demos": [*demos],
-            "learner": learner_for(shared, style.served),
-            "learner_version": shared["learner_version"],
-            "gate": shared["gate"],
-            "poses": shared["poses"],
-            "near": shared["near"],
-            "seed": shared["seed"],
-            "release": shared["release"],
-        }
-        if style.served is not None and style.served.surroundings is not None:
-            request |= {"surroundings": style.served.surroundings.as_json(), "odds": shared["odds"]}
-        if how is not None:
-            request["combine"] = {"kind": how}
-        return request
 
-
-def retrain_part(database: Database, request: PartRequest, settings: Settings) -> Store:
+def retrain_part(database: Database, request: PartRequest, settings: Settings) -> Store[JobResult]:
     """Train the styles of a part that are still queued.
 
     A style that is refused has failed; a style at which the service itself fails stays queued for the next attempt at
@@ -175,15 +93,15 @@ def retrain_part(database: Database, request: PartRequest, settings: Settings) -
     """
     reader = confined_reader(settings)
     with database.reading() as session:
-        job = session.get_one(Job, request["retraining"])
-        shared = cast(RetrainingRequest, job.request)
-        batch = _Batch(job.row, request["part"], shared, job.requested_by, settings, reader.parse)
+        job = session.get_one(Job, request.retraining)
+        shared = RetrainingRequest.model_validate(job.request)
+        batch = _Batch(job.row, request.part, shared, job.requested_by, settings, reader.parse)
     with AT_WORK, closing(reader.server):  # it starts only if a recording is not cached
         _train_all(database, batch)
 
-    def store(session: Session, _actor: str) -> dict[str, Any]:
+    def store(session: Session, _actor: str) -> JobResult:
         jobs.settle(session, batch.row)
-        return {}
+        return JobResult()
 
     return store
 
@@ -217,10 +135,9 @@ def _waiting(database: Database, part: int) -> list[_Style]:
     with database.reading() as session:
         rows = session.execute(left.order_by(of.tries, of.row)).all()
         read = {lesson.row: lesson for lesson in lessons(session, [demonstration for demonstration, *_ in rows])}
-        surgeons = {lesson.surgeon.row for lesson in read.values()}
-        served = settings_of_served(session, surgeons)
+        served = requests_of_served(session, {lesson.surgeon.row for lesson in read.values()})
     found = [(row, tries, read[demonstration]) for demonstration, row, tries in rows]
-    return [_Style(row, tries, one, served.get((one.surgeon.row, one.suture))) for row, tries, one in found]
+    return [_Style(row, tries, one, served.get(one.style)) for row, tries, one in found]
 
 
 def _groups(styles: Sequence[_Style]) -> list[_Group]:
@@ -234,11 +151,11 @@ def _train(database: Database, batch: _Batch, group: _Group, then: _Group) -> bo
 
     The group `then` is marked as started in the last commit.
     """
-    ended: list[tuple[_Style, Learnt | SkillsError]] = []
+    ended: list[_Ended] = []
     since_s = monotonic()
     refused = _refused(database, group)
     for style in group:
-        ended.append((style, refused.get(style.lesson.row) or _learn(database, batch, style)))
+        ended.append((style, refused.get(style.lesson.surgeon.row) or _learn(database, batch, style)))
         if style is not group[-1] and monotonic() - since_s > TOGETHER_S:
             if not _commit(database, batch, ended, ()):
                 return False
@@ -247,47 +164,50 @@ def _train(database: Database, batch: _Batch, group: _Group, then: _Group) -> bo
 
 
 def _refused(database: Database, group: _Group) -> dict[int, SkillsError]:
-    """Return, by demonstration, the errors that forbid learning: consent is read now, not taken from the lessons."""
+    """Return, by surgeon, the errors that forbid learning: consent is read now, not taken from the lessons."""
     with database.reading() as session:
-        found = session.execute(CONSENT, {"demonstrations": [style.lesson.row for style in group]}).all()
-    return {one.row: why for one in found if (why := refusal(one, "training")) is not None}
+        asked = Surgeon.row.in_({style.lesson.surgeon.row for style in group})
+        surgeons = session.scalars(select(Surgeon).where(asked)).all()
+        return {one.row: why for one in surgeons if (why := refusal(one, "training")) is not None}
 
 
 def _learn(database: Database, batch: _Batch, style: _Style) -> Learnt | SkillsError:
     lesson, served = style.lesson, style.served
     try:
-        found, combining = [lesson], None if served is None else served.combining
-        if served is not None and combining is not None:
+        found = [lesson]
+        if served is not None and served.combine is not None:
             with database.reading() as session:
-                newest = newest_demos(session, lesson.surgeon.row, lesson.suture, served.demos)
+                newest = newest_demos(session, lesson.surgeon.row, lesson.suture, len(served.demos))
                 refuse_unlike(newest)
                 found = lessons(session, [one.row for one in newest])
         if not found:
             return Conflict("All demonstrations of the style were withdrawn or marked since the batch was requested.")
-        found = with_partners(database, found, batch.parse)
-        if len(found) == 1:  # also if the others were withdrawn since, and the served policy with them
-            combining = None
-        asked = batch.training_of(style, [one.sha256 for one in found], combining)
-        return learn_style(found[0] if combining is None else combined_lesson(found, combining), asked, batch.settings)
+        found = learning.with_partners(database, found, batch.parse)
+        # A single one is not combined, also if the others were withdrawn since, and the served policy with them.
+        demos = [one.sha256 for one in found]
+        request = batch.request.training_of((lesson.surgeon.slug, lesson.suture), demos, served)
+        return learn_style(combined_lesson(found, request.combine), request, batch.settings)
     except Busy:  # the database or a reader, for now: the part is tried again
         raise
     except SkillsError as refused:
         return refused
 
 
-def _commit(
-    database: Database, batch: _Batch, ended: Sequence[tuple[_Style, Learnt | SkillsError]], then: _Group
-) -> bool:
+def _commit(database: Database, batch: _Batch, ended: Sequence[_Ended], then: _Group) -> bool:
     """End styles, each with its own result, and mark the next group as started; return whether all were queued."""
     with database.reading() as session:  # measured before the locks are taken, which others wait for
-        measured = _measured(session, [learnt for _, learnt in ended if isinstance(learnt, Learnt)])
+        measured = _measured(session, [learnt for _, learnt in ended if isinstance(learnt, Learnt)], {})
     surgeons = {locks.surgeon(style.lesson.surgeon.slug) for style, _ in ended}
     with database.writing([locks.job(batch.row), *surgeons]) as session:
-        queued = set(session.scalars(QUEUED, {"styles": [style.row for style, _ in ended]}))
+        of = StyleToRetrain
+        rows = select(of.row).where(of.row.in_([style.row for style, _ in ended]), of.state == "queued")
+        queued = set(session.scalars(rows))
         wanted = [(style, learnt) for style, learnt in ended if style.row in queued]
         if wanted:
-            session.execute(OUTCOME, list(_outcomes(session, batch, wanted, measured)))
-            session.execute(FURTHER, {"batch": batch.row, "step": len(wanted) * NEARLY_ONE / batch.request["styles"]})
+            session.execute(update(of), list(_outcomes(session, batch, wanted, measured)))
+            step = len(wanted) * NEARLY_ONE / batch.request.styles
+            further = update(Job).where(Job.row == batch.row).values(progress=Job.progress + step)
+            session.execute(further, **UNSYNCHRONISED)
         if len(wanted) == len(ended) and then:
             _begin(session, batch, then)
         return len(wanted) == len(ended)
@@ -295,93 +215,70 @@ def _commit(
 
 def _begin(session: Session, batch: _Batch, group: _Group) -> None:
     """Count a start of each style before it is trained, so that a style that kills its worker can be recognised."""
-    session.execute(BEGIN, [{"style": style.row} for style in group])
-    session.execute(RUNNING, {"batch": batch.row, "now": now()})
+    of = StyleToRetrain
+    started = update(of).where(of.row.in_([style.row for style in group])).values(tries=of.tries + 1)
+    session.execute(started, **UNSYNCHRONISED)
+    first = update(Job).where(Job.row == batch.row, Job.state == "queued")
+    session.execute(first.values(state="running", started_at=now()), **UNSYNCHRONISED)
 
 
 def _outcomes(
-    session: Session,
-    batch: _Batch,
-    ended: Sequence[tuple[_Style, Learnt | SkillsError]],
-    measured: "dict[str, _Measured]",
+    session: Session, batch: _Batch, ended: Sequence[_Ended], measured: "dict[str, _Measured]"
 ) -> Iterator[dict[str, Any]]:
-    """Store the learnt policies, each independently, and yield the values to store for each style."""
+    """Store the learnt policies, each independently, and yield the new values of each style's row."""
     learnt = [one for _, one in ended if isinstance(one, Learnt)]
-    released = _released(session, learnt)
-    changed = [
-        one for one in learnt if one.sha256 in released and not _still(measured.get(one.sha256), released[one.sha256])
-    ]
-    measured = measured | _measured(session, changed)  # another version was released since they were measured
-    stored = iter(store_styles(session, learnt))
+    measured = _measured(session, learnt, measured)  # again where another version was released since
+    stored = iter(learning.store_styles(session, learnt))
     for style, one in ended:
         at = next(stored) if isinstance(one, Learnt) else one
-        ending = {"style": style.row, "now": now(), "policy": None, "compared": None, "why": None}
+        ending = {"row": style.row, "ended_at": now(), "policy_row": None, "comparison": None, "reason": None}
         if isinstance(one, Learnt) and isinstance(at, Stored):
-            compared = measured[one.sha256] if one.sha256 in released else None
-            comparison = _compared(session, batch, one, at, compared)
-            yield {**ending, "became": "done", "policy": at.row, "compared": comparison}
+            comparison = _compared(session, batch, one, at, measured.get(one.sha256))
+            yield {**ending, "state": "done", "policy_row": at.row, "comparison": comparison}
         else:
-            yield {**ending, "became": "failed", "why": str(at)[:LONGEST_REASON]}
+            yield {**ending, "state": "failed", "reason": str(at)[:LONGEST_REASON]}
 
 
 # ---- release -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class _Served:
-    """The policy version that a style serves: its row and its manifest."""
-
-    policy: int
-    version: int
-    sha256: str
-    manifest: PolicyManifest
-
-
-@dataclass(frozen=True, eq=False)
 class _Measured:
     """The version that a style serves, and the distances of it and of the learnt one from the same demonstrations."""
 
-    served: _Served
+    served: PolicyVersion
     fit: FitOnTheSame
 
 
-def _released(session: Session, learnt: Sequence[Learnt]) -> dict[str, _Served]:
-    """Return, by the digest of each learnt policy, the version that its style serves; others are left out."""
-    rows = {one.lesson.row: one.sha256 for one in learnt}
-    found = session.execute(SERVED, {"demonstrations": [*rows]})
-    return {rows[row]: _Served(*about) for row, *about in found}
-
-
-def _measured(session: Session, learnt: Sequence[Learnt]) -> dict[str, _Measured]:
+def _measured(session: Session, learnt: Sequence[Learnt], before: Mapping[str, _Measured]) -> dict[str, _Measured]:
     """Measure each learnt policy and the version that its style serves against the same demonstrations.
+
+    Args:
+        session: The caller's transaction.
+        learnt: The policies, each of another style.
+        before: Results of an earlier call, which still hold for the styles that serve the same version.
 
     Returns:
         By the digest of the learnt policy; styles that serve nothing are left out.
     """
-    served = _released(session, learnt)
-    if not served:
-        return {}
-    rests_on = {one.sha256: {one.lesson.row, *one.lesson.others} for one in learnt}
-    by_policy = {one.policy: sha256 for sha256, one in served.items()}
-    for policy, demonstration in session.execute(RESTS_ON, {"policies": [*by_policy]}):
-        rests_on[by_policy[policy]].add(demonstration)
-    demos = reference_paths(session, set().union(*(rests_on[sha256] for sha256 in served)))
-    measured = {}
-    for one in learnt:
-        if (before := served.get(one.sha256)) is not None:
-            released = policy_path(before.manifest, partial(_policy, session, before.policy))
-            trained = policy_path(one.manifest, partial(unpack_as, Policy, one.policy))
-            same = [demo for row, demo in demos.items() if row in rests_on[one.sha256]]
-            measured[one.sha256] = _Measured(before, compare_paths(released, trained, same))
-    return measured
-
-
-def _policy(session: Session, row: int) -> Policy:
-    return integrity.learnt(session.get_one(PolicyVersion, row))
-
-
-def _still(measured: _Measured | None, served: _Served) -> bool:
-    return measured is not None and measured.served.policy == served.policy
+    released = releases.served_versions(session, {one.lesson.style for one in learnt})
+    pairs = [(one, released[one.lesson.style]) for one in learnt if one.lesson.style in released]
+    known = {one.sha256: before.get(one.sha256) for one, _ in pairs}
+    found = {one.sha256: m for one, served in pairs if (m := known[one.sha256]) and m.served.row == served.row}
+    pairs = [(one, served) for one, served in pairs if one.sha256 not in found]
+    rests_on = {served.row: {one.lesson.row, *one.lesson.others, served.demonstration_row} for one, served in pairs}
+    others = select(PolicyDemonstration).where(PolicyDemonstration.policy_row.in_(rests_on))
+    for other in session.scalars(others):
+        rests_on[other.policy_row].add(other.demonstration_row)
+    references = reference_paths(session, set().union(*rests_on.values()))
+    for one, served in pairs:
+        paths = (
+            policy_path(served.sha256, served.manifest, partial(integrity.learnt, served)),
+            policy_path(one.sha256, one.manifest, partial(unpack_as, Policy, one.policy)),
+        )
+        same = [path for row, path in references.items() if row in rests_on[served.row]]
+        found[one.sha256] = _Measured(served, compare_paths(*paths, same))
+    return found
 
 
 def _compared(
@@ -394,7 +291,7 @@ def _compared(
     else:
         served = measured.served
         comparison = compare(figures(served.version, served.sha256, served.manifest), trained, measured.fit)
-    if batch.request["release"]:
+    if batch.request.release:
         comparison = _release(session, stored.row, comparison, batch.requested_by)
     return comparison
 

@@ -40,7 +40,7 @@ from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import card_words as words
 from skills.library.policies import releases
 from skills.library.policies.card_words import sentence, sentences
-from skills.library.policies.combined import combined_of, learnt_from
+from skills.library.policies.combined import learnt_from
 from skills.library.recordings.reports import full_report
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
@@ -108,7 +108,7 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
     recordings = {one.recording.row: one.recording for one in demonstrations}.values()
     # First, so that no fact is taken from a damaged row.
     _refuse_damaged([*recordings, *demonstrations, *rewards, version, *released])
-    coverage, demo, combined = covered(version), learnt_from(version), _combined(version)
+    coverage, learnt_path, combined = covered(version), learnt_from(version), _combined(version)
     facts = PolicyCard.model_construct(  # without the checkpoint of the history, see `Card.under`
         format=FORMAT,
         written_by=f"suture-skills {__version__}",
@@ -126,11 +126,11 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
         metrics=_metrics(version),
         certificate=version.manifest.grid_certificate,
         coverage=_coverage(version, coverage),
-        limits=_limits(version, demo),
+        limits=_limits(version, learnt_path.demo),
         lineage=_lineage(session, version),
         citation=words.citation(version),
     )
-    return Card(facts, demo, learnt(version).path, coverage, combined_of(version))
+    return Card(facts, learnt_path.demo, learnt(version).path, coverage, learnt_path.combined)
 
 
 def _refuse_damaged(rows: Sequence[Any]) -> None:
@@ -149,22 +149,13 @@ def _refuse_damaged(rows: Sequence[Any]) -> None:
 
 
 def _policy(version: PolicyVersion) -> CardPolicy:
-    manifest = version.manifest
-    return CardPolicy(
+    return CardPolicy.from_attributes_of(
+        version.manifest,
         sha256=version.sha256,
         version=version.version,
-        surgeon=version.surgeon.slug,
-        suture=version.suture,
         training=version.training,
         created_at=version.created_at,
-        arm=manifest.arm,
-        frame=manifest.frame,
-        instrument=manifest.instrument,
-        grid=manifest.grid,
-        start_mm=manifest.start_mm,
-        goal_mm=manifest.goal_mm,
-        phases=manifest.phases,
-        n_states=manifest.coverage.n_states,
+        n_states=version.manifest.coverage.n_states,
         where=f"/policy-versions/{version.sha256}",
     )
 
@@ -184,12 +175,7 @@ def _status(session: Session, version: PolicyVersion, released: Sequence[Release
         releasable=version.releasable and not refused,
         refused_because=refused,
         releases=[
-            CardRelease(
-                released_at=one.released_at,
-                released_by=one.released_by,
-                withdrawn_at=one.withdrawn_at,
-                serving=serving is not None and serving.row == one.row,
-            )
+            CardRelease.from_attributes_of(one, serving=serving is not None and serving.row == one.row)
             for one in released
         ],
         in_words=sentence("status", version.version, served and served.version, refused, bool(released)),
@@ -197,48 +183,21 @@ def _status(session: Session, version: PolicyVersion, released: Sequence[Release
 
 
 def _surgeon(surgeon: Surgeon) -> CardSurgeon:
-    return CardSurgeon(
-        pseudonym=surgeon.slug,
-        skill_level=surgeon.skill_level,
-        handedness=surgeon.handedness,
-        protocol=surgeon.protocol,
-        consent=surgeon.consent,
-        consent_in_words=sentence("consent", surgeon.consent),
-    )
+    words = sentence("consent", surgeon.consent)
+    return CardSurgeon.from_attributes_of(surgeon, pseudonym=surgeon.slug, consent_in_words=words)
 
 
 def _demonstration(row: Demonstration) -> CardDemonstration:
-    recording, report, path = row.recording, full_report(row), row.path
-    return CardDemonstration(
-        sha256=row.sha256,
-        state="active" if row.withdrawn_at is None else "withdrawn",
-        withdrawn_at=row.withdrawn_at,
-        outcome=row.outcome,
-        outcome_reason=row.outcome_reason,
+    report, here = full_report(row), f"/demos/{row.sha256}"
+    return CardDemonstration.from_attributes_of(
+        row,
         state_in_words=sentence("demonstration_state", row.withdrawn_at, row.outcome, row.outcome_reason),
-        arm=row.arm,
-        topic=row.topic,
-        frame=row.frame,
-        instrument=row.instrument,
-        start_s=row.start_s,
-        end_s=row.end_s,
-        session=row.session,
-        hysteresis=path.hysteresis,
-        path_states=len(path.states),
-        created_at=row.created_at,
+        path_states=len(row.path.states),
         report=REPORT.validate_python(report),
         quality_in_words=sentences("quality", report),
         lost_in_words=sentence("lost", report),
-        where=f"/demos/{row.sha256}",
-        recording=CardRecording(
-            sha256=recording.sha256,
-            format=recording.format,
-            media_type=recording.media_type,
-            size_bytes=recording.size_bytes,
-            integrity=recording.integrity,
-            created_at=recording.created_at,
-            where=f"/demos/{row.sha256}/recording",
-        ),
+        where=here,
+        recording=CardRecording.from_attributes_of(row.recording, where=f"{here}/recording"),
     )
 
 
@@ -251,15 +210,12 @@ def _combined(version: PolicyVersion) -> CardCombined | None:
 
 
 def _learner(version: PolicyVersion) -> CardLearner:
-    manifest = version.manifest
-    return CardLearner(
-        kind=manifest.learner,
-        version=manifest.learner_version,
-        settings=manifest.settings,
-        seed=manifest.seed,
-        reward_levels=manifest.reward_levels,
-        training=manifest.training,
-        in_words=sentence("learner", manifest, any(one.outcome is not None for one in version.demonstrations)),
+    marked = any(one.outcome is not None for one in version.demonstrations)
+    return CardLearner.from_attributes_of(
+        version.manifest,
+        kind=version.manifest.learner,
+        version=version.manifest.learner_version,
+        in_words=sentence("learner", version.manifest, marked),
     )
 
 

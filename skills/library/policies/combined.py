@@ -5,6 +5,7 @@ demonstrations again, which gives the same result; `skills verify` compares the 
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from sqlalchemy.orm import Session
 
@@ -16,11 +17,11 @@ from skills.gridworld.grid import GridPath
 from skills.library.recordings.demos import find_demo, newest_demos
 from skills.remedies import Action, Remedy
 from skills.schemas.policies import Combined as CombinedFigures
+from skills.schemas.training import CombineIn
 
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
 
-
-BEST: Combining = "corridor"  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
+BEST = CombineIn(kind="corridor")  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
 
 
 def choose_demos(
@@ -106,24 +107,21 @@ def describe_combined(found: Followed, how: Combining, demos: Sequence[str]) -> 
     )
 
 
-def learnt_from(version: PolicyVersion) -> Demo:
-    """Return the demonstration that a policy was learnt from, or the one that its demonstrations were combined into."""
-    return version.demonstration.demo if (found := _followed(version)) is None else found.demo
+class LearntFrom(NamedTuple):
+    """What a policy was learnt from: a demonstration with its path, or those into which several were combined."""
+
+    demo: Demo
+    path: GridPath
+    combined: Combined | None
 
 
-def path_of(version: PolicyVersion) -> GridPath:
-    """Return the path that a policy was learnt from, computed from its demonstrations and not read from the policy."""
-    return version.demonstration.path if (found := _followed(version)) is None else found.path
+def learnt_from(version: PolicyVersion) -> LearntFrom:
+    """Return what a policy was learnt from, computed from its demonstrations and not read from the policy.
 
-
-def combined_of(version: PolicyVersion) -> Combined | None:
-    """Return the combination of a policy's demonstrations; None for a single one."""
-    return None if (found := _followed(version)) is None else found.combined
-
-
-def _followed(version: PolicyVersion) -> Followed | None:
-    """Combine the demonstrations of a policy again, which gives the same result; None for a single one."""
-    if (combined := version.manifest.combined) is None:
-        return None
-    rows = version.demonstrations
-    return followed([one.demo for one in rows], [one.path for one in rows], combined.kind)
+    Several are combined again, which gives the same result.
+    """
+    rows, combined = version.demonstrations, version.manifest.combined
+    if combined is None:
+        return LearntFrom(rows[0].demo, rows[0].path, None)
+    found = followed([one.demo for one in rows], [one.path for one in rows], combined.kind)
+    return LearntFrom(found.demo, found.path, found.combined)

@@ -6,9 +6,9 @@ every demonstration's path in its grid, in mm, and the sum over the demonstratio
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from functools import partial
 from math import nan
+from typing import NamedTuple
 
 import numpy as np
 from sqlalchemy import select
@@ -16,7 +16,6 @@ from sqlalchemy.orm import Session
 
 from skills.arrays import Floats
 from skills.db.models import Demonstration, PolicyVersion
-from skills.gridworld.grid import GridPath
 from skills.learning.evaluation import dtw
 from skills.learning.policy import Policy
 from skills.library.operation.integrity import learnt
@@ -28,21 +27,12 @@ ROUNDING_MM = 1e-6  # two sums of the same distances in different order differ b
 Space = tuple[str, str]  # arm and frame; paths in different ones cannot be compared
 
 
-@dataclass(frozen=True, eq=False)
-class ReferencePath:
-    """The path of a demonstration that a policy may have been learnt from."""
+class StylePath(NamedTuple):
+    """The path of a demonstration in its grid, or of a policy from its demonstrated start, shape (T, 3) in mm."""
 
     sha256: str
     space: Space
-    path: GridPath
-
-
-@dataclass(frozen=True, eq=False)
-class PolicyPath:
-    """The path of a policy from its demonstrated start, shape (T, 3) in mm."""
-
     tip_mm: Floats
-    space: Space
 
 
 def not_worse(fit: FitOnTheSame) -> bool:
@@ -57,7 +47,7 @@ def format_mm(total_mm: float | None) -> str:
     return f"{nan if total_mm is None else total_mm:g}"
 
 
-def compare_paths(released: PolicyPath, trained: PolicyPath, references: Sequence[ReferencePath]) -> FitOnTheSame:
+def compare_paths(released: StylePath, trained: StylePath, references: Sequence[StylePath]) -> FitOnTheSame:
     """Measure two policies against the same demonstrations.
 
     Args:
@@ -67,37 +57,38 @@ def compare_paths(released: PolicyPath, trained: PolicyPath, references: Sequenc
     """
     comparable = references and len({released.space, trained.space, *(one.space for one in references)}) == 1
 
-    def total_mm(path: PolicyPath) -> float | None:
+    def total_mm(path: StylePath) -> float | None:
         if not comparable:
             return None
-        return float(sum(dtw(path.tip_mm, one.path.tip_mm).total_mm for one in references))
+        return float(sum(dtw(path.tip_mm, one.tip_mm).total_mm for one in references))
 
     return FitOnTheSame(tuple(one.sha256 for one in references), total_mm(released), total_mm(trained))
 
 
-def policy_path(manifest: PolicyManifest, policy: Callable[[], Policy]) -> PolicyPath:
+def policy_path(sha256: str, manifest: PolicyManifest, policy: Callable[[], Policy]) -> StylePath:
     """Return the path of a policy from its demonstrated start.
 
     Args:
-        manifest: The policy's manifest.
+        sha256: The policy's digest.
+        manifest: Its manifest.
         policy: Loads the policy; called only if it does not reproduce its demonstration, because otherwise the manifest
             has the path.
     """
     if not manifest.grid_certificate.demonstration_reproduced:
-        return PolicyPath(policy().replay.tip_mm, manifest.space)
-    return PolicyPath(manifest.grid.centres_mm(np.array(manifest.waypoints)), manifest.space)
+        return StylePath(sha256, manifest.space, policy().replay.tip_mm)
+    return StylePath(sha256, manifest.space, manifest.grid.centres_mm(np.array(manifest.waypoints)))
 
 
-def reference_paths(session: Session, demonstrations: Collection[int]) -> dict[int, ReferencePath]:
+def reference_paths(session: Session, demonstrations: Collection[int]) -> dict[int, StylePath]:
     """Return the paths of the active ones of some demonstrations, by row, the oldest first."""
     of = Demonstration
     query = select(of.row, of.sha256, of.arm, of.frame, of.path).where(of.row.in_(demonstrations))
     found = session.execute(query.where(of.withdrawn_at.is_(None)).order_by(of.row))
-    return {row: ReferencePath(sha256, (arm, frame), path) for row, sha256, arm, frame, path in found}
+    return {row: StylePath(sha256, (arm, frame), path.tip_mm) for row, sha256, arm, frame, path in found}
 
 
 def compare_versions(session: Session, released: PolicyVersion, trained: PolicyVersion) -> FitOnTheSame:
     """Measure two stored versions of a style against the active demonstrations from which either was learnt."""
     rows = {one.row for version in (released, trained) for one in version.demonstrations}
-    before, after = (policy_path(one.manifest, partial(learnt, one)) for one in (released, trained))
+    before, after = (policy_path(one.sha256, one.manifest, partial(learnt, one)) for one in (released, trained))
     return compare_paths(before, after, list(reference_paths(session, rows).values()))

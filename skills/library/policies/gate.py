@@ -1,8 +1,7 @@
 """The release gate: reasons on the grid and of the arm's joint limits against a release."""
 
-from collections.abc import Sequence
-from dataclasses import asdict
-from typing import TypeVar
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan
@@ -19,10 +18,10 @@ from skills.learning.dynamic_programming import FAINT
 from skills.learning.policy import Policy
 from skills.planning.plan import DrivenPass, driven_pass
 from skills.schemas.policies import GateRefusal, RefusalKind
+from skills.settings import Settings
 
 GATE_VERSION = 1  # part of a training's identity: raise it when the gate's result for an equal policy changes
 
-T = TypeVar("T", NearLimits, OddsLimits)
 _OTHERWISE = "Train it with other settings or another learner, or record the hand-off again."
 # Of several reasons the first one here is remedied: training again is of no use before it.
 _REMEDIES: dict[RefusalKind, str] = {
@@ -40,9 +39,22 @@ _REMEDIES: dict[RefusalKind, str] = {
 }
 
 
-def limits_of(kind: type[T], judged: T) -> T:
-    """Return the limits alone under which something was judged."""
-    return kind(**{name: getattr(judged, name) for name in asdict(kind())})
+class GateLimits(NamedTuple):
+    """The gate's limits: at the starts near the demonstrated one, and in a scene."""
+
+    near: NearLimits = NearLimits()
+    odds: OddsLimits = OddsLimits()
+
+    @classmethod
+    def of(cls, settings: Settings) -> "GateLimits":
+        """Return those that an installation sets."""
+        return cls(
+            NearLimits(settings.near_radius_mm, settings.near_least_share),
+            OddsLimits(settings.scene_least_finishing, settings.scene_most_touching),
+        )
+
+
+DEFAULT_LIMITS = GateLimits()
 
 
 def remedy(reasons: Sequence[GateRefusal]) -> str:
@@ -64,59 +76,55 @@ def refusals(
     In a scene the odds count in place of optimal actions and of starts that reach the goal: sampled values are not
     exact beside rare and costly touches, and cells in tissue reach nothing.
     """
-    if odds is not None:
-        return [*_unlikely(odds), *_not_the_style(policy, certificate, near)]
-    reasons: list[GateRefusal] = []
+    first = _inexact(policy, certificate) if odds is None else _unlikely(odds)
+    return [GateRefusal(kind, text) for kind, text in (*first, *_not_the_style(policy, certificate, near))]
+
+
+def _inexact(policy: Policy, certificate: Certificate) -> Iterator[tuple[RefusalKind, str]]:
+    """Yield the reasons why actions and starts are against a release."""
     if not certificate.every_action_optimal:
-        text = f"{certificate.suboptimal} of {certificate.checked} greedy actions are not optimal"
-        reasons.append(GateRefusal("not optimal", text))
+        yield "not optimal", f"{certificate.suboptimal} of {certificate.checked} greedy actions are not optimal"
     if not certificate.every_action_optimal and certificate.faint:
         gamma = least_gamma(policy)
-        text = (
+        yield (
+            "faint",
             f"{certificate.faint} of them are so far from the path that their values, with gamma "
             f"{policy.learner.gamma:g}, are below {FAINT:g}, too small to be learnt; train with larger cells, or with "
-            f"a gamma {'nearer to 1' if gamma is None else f'of {gamma:g}'}"
+            f"a gamma {'nearer to 1' if gamma is None else f'of {gamma:g}'}",
         )
-        reasons.append(GateRefusal("faint", text))
     if certificate.starts_reaching < certificate.starts:
         missing = certificate.starts - certificate.starts_reaching
-        reasons.append(GateRefusal("unreached", f"{missing} of {certificate.starts} starts do not reach the goal"))
+        yield "unreached", f"{missing} of {certificate.starts} starts do not reach the goal"
     if certificate.off_rule:
-        text = (
+        yield (
+            "off rule",
             f"{certificate.off_rule} of {certificate.checked} greedy actions are not the ones that the rule among "
-            "equally good actions selects"
+            "equally good actions selects",
         )
-        reasons.append(GateRefusal("off rule", text))
-    return reasons + _not_the_style(policy, certificate, near)
 
 
-def _unlikely(odds: NearOdds) -> list[GateRefusal]:
-    """Return the reason why the odds in a scene are against a release, if they are."""
-    if odds.within:
-        return []
-    text = (
-        f"of {odds.starts} starts near the demonstrated one, one finishes with a probability of {odds.finishing:.1%}, "
-        f"and one touches the scene with {odds.touching:.1%}; the gate requires at least {odds.least_finishing:.0%} "
-        f"and at most {odds.most_touching:.0%}"
-    )
-    return [GateRefusal("scene odds", text)]
+def _unlikely(odds: NearOdds) -> Iterator[tuple[RefusalKind, str]]:
+    """Yield the reason why the odds in a scene are against a release, if they are."""
+    if not odds.within:
+        yield (
+            "scene odds",
+            f"of {odds.starts} starts near the demonstrated one, one finishes with a probability of "
+            f"{odds.finishing:.1%}, and one touches the scene with {odds.touching:.1%}; the gate requires at least "
+            f"{odds.least_finishing:.0%} and at most {odds.most_touching:.0%}",
+        )
 
 
-def _not_the_style(policy: Policy, certificate: Certificate, near: NearStarts) -> list[GateRefusal]:
-    """Return the reasons why a policy does not follow the demonstration from its start or near it."""
-    reasons: list[GateRefusal] = []
+def _not_the_style(policy: Policy, certificate: Certificate, near: NearStarts) -> Iterator[tuple[RefusalKind, str]]:
+    """Yield the reasons why a policy does not follow the demonstration from its start or near it."""
     if policy.learner.phased and not certificate.demonstration_reproduced:
-        reasons.append(
-            GateRefusal("not reproduced", "the rollout from the demonstrated start is not the demonstration")
-        )
+        yield "not reproduced", "the rollout from the demonstrated start is not the demonstration"
     if policy.learner.phased and not near.within:
-        text = (
+        yield (
+            "near starts",
             f"of {near.starts} starts within {near.radius_mm:g} mm of the demonstrated one, one follows only "
             f"{near.share:.0%} of the demonstration, and the gate requires {near.least_share:.0%}; train with a "
-            f"joining rule such as --join {max(near.least_share, 0.5):g}, which leads them back to an earlier part"
+            f"joining rule such as --join {max(near.least_share, 0.5):g}, which leads them back to an earlier part",
         )
-        reasons.append(GateRefusal("near starts", text))
-    return reasons
 
 
 def driven_or_refused(policy: Policy, demo: Demo) -> tuple[DrivenPass | None, list[GateRefusal]]:

@@ -2,26 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce
-from sqlalchemy.orm import Session
+from sqlalchemy import LargeBinary, func, insert, select, type_coerce
+from sqlalchemy.orm import Session, aliased
 
 from skills.arrays import xyz
-from skills.comparison.combining import Combining, followed
-from skills.db.models import (
-    SUCCESS,
-    Demonstration,
-    LastUsed,
-    PolicyDemonstration,
-    PolicyVersion,
-    StoredPoses,
-    StoredRecording,
-    StoredRewardMap,
-    Surgeon,
-    newest_mark,
-)
+from skills.comparison.combining import followed
+from skills.db import models
+from skills.db.models import Demonstration, PolicyVersion, Surgeon
 from skills.db.packed import Sealed, seal, unpack_as
 from skills.db.service_tables import record_events
 from skills.db.session import Database
@@ -31,73 +21,27 @@ from skills.demonstration.partner import PartnerMotion
 from skills.demonstration.recording import Recording
 from skills.errors import Conflict, NotFound, SkillsError
 from skills.gridworld.grid import discretisation_rmse
-from skills.gridworld.hazards import Surroundings, hazards_of
+from skills.gridworld.hazards import hazards_of
 from skills.gridworld.reward import RewardMap, sparse_reward
-from skills.learning.certificate import (
-    NearLimits,
-    OddsLimits,
-    certify,
-    near_odds,
-    near_starts,
-)
+from skills.learning.certificate import certify, near_odds, near_starts
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.in_scene import certify_in_scene, learn_in_scene, scene_learner
-from skills.learning.policy import (
-    Policy,
-    describe_settings,
-    learner_of,
-)
+from skills.learning.policy import Policy, describe_settings
 from skills.learning.ties import rule_in
 from skills.learning.tube import certified_poses
 from skills.library.operation.integrity import poses_identity_of, scene_digest
-from skills.library.operation.jobs import TrainingRequest
 from skills.library.people.consent import refusal, require
 from skills.library.policies.combined import describe_combined
 from skills.library.policies.gate import driven_or_refused, refusals
+from skills.library.policies.releases import Style
+from skills.library.policies.requests import TrainingRequest
 from skills.library.recordings.recordings import Parser, stored_recording
-from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas import DemoOutcome, Grid
-from skills.schemas.policies import Combined as CombinedFigures
-from skills.schemas.policies import Coverage, GridCertificate, Joining, PolicyManifest, PolicyScene, TrainingFigures
+from skills.schemas import policies as schemas
+from skills.schemas.policies import PolicyManifest
+from skills.schemas.training import CombineIn
 from skills.settings import Settings
-
-ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
-# Statements executed for every style, built once: building one takes as long as executing it.
-_VERSIONS, _DEMOS, _SURGEONS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration, Surgeon))
-
-
-_OF_STYLE, _USED = _VERSIONS.alias("of_style"), cast(Table, LastUsed.__table__)
-
-
-DEMO_STATES = (
-    select(
-        _DEMOS.c.row,
-        _DEMOS.c.withdrawn_at,
-        newest_mark("outcome", _DEMOS.c.row).label("outcome"),
-        _SURGEONS.c.slug,
-        _SURGEONS.c.consent,
-        select(func.max(_OF_STYLE.c.version))
-        .where(_OF_STYLE.c.surgeon_row == _DEMOS.c.surgeon_row, _OF_STYLE.c.suture == _DEMOS.c.suture)
-        .scalar_subquery()
-        .label("last"),
-        select(func.max(_USED.c.last))
-        .where(_USED.c.surgeon_row == _DEMOS.c.surgeon_row, _USED.c.suture == _DEMOS.c.suture)
-        .scalar_subquery()
-        .label("used"),
-    )
-    .join_from(_DEMOS, _SURGEONS, _SURGEONS.c.row == _DEMOS.c.surgeon_row)
-    .where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
-)
-
-
-KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
-    _VERSIONS.c.sha256.in_(bindparam("digests", expanding=True))
-)
-
-
-ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
-
 
 ERASED = "A demonstration was erased while the training used it."
 
@@ -130,9 +74,14 @@ class Lesson:
     recording: str
     partners: tuple[PartnerMotion | None, ...] = (None,)
     others: tuple[int, ...] = ()
-    combined: CombinedFigures | None = None
+    combined: schemas.Combined | None = None
     shown: tuple[bytes, ...] = ()
     at: int = 0
+
+    @property
+    def style(self) -> Style:
+        """The surgeon's row, and the suture type."""
+        return self.surgeon.row, self.suture
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,12 +107,12 @@ class Stored(NamedTuple):
 def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
     """Return the lessons of some demonstrations, in the order of the rows."""
     of = Demonstration
-    packed = type_coerce(of.demo, LargeBinary), type_coerce(StoredRewardMap.map, LargeBinary)
+    packed = type_coerce(of.demo, LargeBinary), type_coerce(models.StoredRewardMap.map, LargeBinary)
     query = (
-        select(of.row, of.sha256, Surgeon, of.suture, *packed, of.outcome, StoredRecording.sha256)
+        select(of.row, of.sha256, Surgeon, of.suture, *packed, of.outcome, models.StoredRecording.sha256)
         .join(Surgeon, Surgeon.row == of.surgeon_row)
-        .join(StoredRecording, StoredRecording.row == of.recording_row)
-        .join(StoredRewardMap, StoredRewardMap.demonstration_row == of.row)
+        .join(models.StoredRecording, models.StoredRecording.row == of.recording_row)
+        .join(models.StoredRewardMap, models.StoredRewardMap.demonstration_row == of.row)
         .where(of.row.in_(demonstrations))
     )
     found = session.execute(query.order_by(of.row))
@@ -211,15 +160,17 @@ def with_partners(database: Database, lessons: Sequence[Lesson], parse: Parser) 
     return found
 
 
-def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
-    """Combine the lessons of one style, the oldest first, into one.
+def combined_lesson(lessons: Sequence[Lesson], combine: CombineIn | None) -> Lesson:
+    """Combine the lessons of one style, the oldest first, into one; a single one (None) is returned as it is.
 
     Raises:
         Corrupt: A demonstration does not match its digest.
         BadPath: They cannot be aligned, or their combined path has no path in the grid.
     """
+    if combine is None:
+        return lessons[0]
     rewards = [unpack_as(RewardMap, lesson.reward) for lesson in lessons]
-    found = followed([unpack_as(Demo, one.demo) for one in lessons], [reward.path for reward in rewards], how)
+    found = followed([unpack_as(Demo, one.demo) for one in lessons], [reward.path for reward in rewards], combine.kind)
     at = found.combined.at
     return replace(
         lessons[at],
@@ -230,7 +181,7 @@ def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
         partners=tuple(partner for lesson in lessons for partner in lesson.partners),
         at=at,
         others=tuple(lesson.row for lesson in lessons if lesson is not lessons[at]),
-        combined=describe_combined(found, how, [lesson.sha256 for lesson in lessons]),
+        combined=describe_combined(found, combine.kind, [lesson.sha256 for lesson in lessons]),
     )
 
 
@@ -253,17 +204,15 @@ def learn_style(
     """
     require(lesson.surgeon, "training")  # fails early; the check that counts is repeated in the transaction that stores
     demo, reward = unpack_as(Demo, lesson.demo), unpack_as(RewardMap, lesson.reward)
-    learner = learner_of(request["learner"])
-    if "surroundings" in request:
-        given = Surroundings.of_json(request["surroundings"])
+    if (given := request.surroundings) is not None:
         hazards = hazards_of(given.scene, reward.path, demo.frame, given.costs)
-        policy = learn_in_scene(reward, scene_learner(learner), hazards, request["seed"])
+        policy = learn_in_scene(reward, scene_learner(request.learner), hazards, request.seed)
         return certified(lesson, request, demo, policy)
     policy = learn_policy(
         reward,
-        learner,
-        request["seed"],
-        ties=rule_in(demo.frame, request.get("depth_along")),
+        request.learner,
+        request.seed,
+        ties=rule_in(demo.frame, request.depth_along),
         progress=progress,
         timeout_s=settings.learning_timeout_s,
         memory_bytes=settings.learning_memory_bytes,
@@ -282,12 +231,13 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
     poses = certified_poses(shown, lesson.at, partners=lesson.partners)
     numbers, coverage = seal(policy), seal(covered)
     driven, undriven = driven_or_refused(policy, demo)
-    limits = NearLimits(**request["near"])
-    near = near_starts(policy, covered.share, limits)
-    chances = None if in_scene is None else near_odds(policy, covered, limits, OddsLimits(**request["odds"]))
+    near = near_starts(policy, covered.share, request.near)
+    chances = (
+        None if in_scene is None or request.odds is None else near_odds(policy, covered, request.near, request.odds)
+    )
     manifest = PolicyManifest(
-        surgeon=request["surgeon"],
-        suture=request["suture"],
+        surgeon=request.surgeon,
+        suture=request.suture,
         arm=demo.arm,
         frame=demo.frame,
         instrument=demo.instrument,
@@ -297,14 +247,14 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
         waypoints=policy.path.states.tolist(),
         phases=policy.domain.phases,
         learner=policy.learner.kind,
-        learner_version=request["learner_version"],
+        learner_version=request.learner_version,
         settings=describe_settings(policy.learner),
         reward_levels=policy.levels,
         seed=policy.seed,
-        demos=request["demos"],
-        training=TrainingFigures(**vars(policy.training)),
+        demos=request.demos,
+        training=schemas.TrainingFigures(**vars(policy.training)),
         metrics=measure(policy.replay, discretisation_rmse(demo.tip_mm, policy.path.grid, policy.path.hysteresis)),
-        coverage=Coverage(
+        coverage=schemas.Coverage(
             starts_reaching_goal=certificate.starts_reaching,
             starts_joining_nearest=certificate.starts_joining_nearest,
             n_states=certificate.starts,
@@ -313,14 +263,14 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
             median_share=certificate.median_share,
             starts_goal_alone=certificate.starts_goal_alone,
         ),
-        grid_certificate=GridCertificate(
+        grid_certificate=schemas.GridCertificate(
             states_checked=certificate.checked,
             states_finishing=certificate.finishing,
             suboptimal_actions=certificate.suboptimal,
             actions_off_rule=certificate.off_rule,
             demonstration_reproduced=certificate.demonstration_reproduced,
             refused_because=(*refusals(policy, certificate, near, chances), *undriven),
-            gate=request["gate"],
+            gate=request.gate,
             near=near,
             driven=driven,
             note=CERTIFICATE_NOTE,
@@ -328,12 +278,12 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
         combined=lesson.combined,
         rollouts=check_in_space(policy),
         # Without a training from any outcome none of them is marked recovery or failure.
-        outcomes=[*lesson.outcomes] if request.get("outcomes") == ANY else None,
+        outcomes=[*lesson.outcomes] if request.outcomes else None,
         joining=_joining(policy),
         ties=policy.ties,
         scene=None
         if policy.surroundings is None or in_scene is None or chances is None
-        else PolicyScene(
+        else schemas.PolicyScene(
             sha256=scene_digest(policy.surroundings.scene),
             scene=policy.surroundings.scene,
             costs=policy.surroundings.costs,
@@ -343,7 +293,7 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
     )
     return Learnt(
         lesson=lesson,
-        training=sha256(canonical(request)),
+        training=request.identity,
         sha256=manifest.identity(numbers.digest),
         manifest=manifest,
         policy=numbers.packed,
@@ -372,21 +322,22 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
     Returns:
         For each, in order, the stored version, or the error for which it was not stored.
     """
-    states = {one.row: one for one in session.execute(DEMO_STATES, {"demonstrations": [o.lesson.row for o in learnt]})}
-    known = _stored(session.execute(KNOWN, {"digests": [one.sha256 for one in learnt]}))
+    states = demo_states(session, [one.lesson.row for one in learnt])
+    known = find_stored(session, [one.sha256 for one in learnt])
     refused = {one.sha256: _refusal(session, one, states.get(one.lesson.row)) for one in learnt}
     # A version that is already stored is returned as it is, so a retry of a job stores nothing twice.
     new = [one for one in learnt if one.sha256 not in known and refused[one.sha256] is None]
     if new:
         of_style = [states[one.lesson.row] for one in new]
         values = [_version(one, max(of.last or 0, of.used or 0) + 1) for one, of in zip(new, of_style, strict=True)]
-        known |= _stored(session.execute(ADD, values))
+        session.execute(insert(PolicyVersion), values)
+        known = find_stored(session, [one.sha256 for one in learnt])
         record_events(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
     rests_on = [
         {"policy_row": known[one.sha256].row, "demonstration_row": other} for one in new for other in one.lesson.others
     ]
     if rests_on:
-        session.execute(insert(PolicyDemonstration), rests_on)
+        session.execute(insert(models.PolicyDemonstration), rests_on)
     poses = [
         {"policy_row": known[one.sha256].row, "poses": one.poses.packed}
         | {"sha256": poses_identity_of(one.sha256, one.poses.digest)}
@@ -394,12 +345,29 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
         if one.poses is not None
     ]
     if poses:
-        session.execute(insert(StoredPoses), poses)
+        session.execute(insert(models.StoredPoses), poses)
     return [refused[one.sha256] or known[one.sha256] for one in learnt]
 
 
-def _stored(found: Result[Any]) -> dict[str, Stored]:
-    return {one.sha256: Stored(one.row, one.version) for one in found}
+def demo_states(session: Session, rows: Sequence[int]) -> dict[int, Any]:
+    """Return, by row, the states of demonstrations that decide on storing, and the last numbers of their styles.
+
+    `last` is the number of the newest version that is stored, and `used` of the newest one that is not any more.
+    """
+    of, version, erased = Demonstration, aliased(PolicyVersion), aliased(models.LastUsed)
+    last = select(func.max(version.version)).where(version.surgeon_row == of.surgeon_row, version.suture == of.suture)
+    used = select(func.max(erased.last)).where(erased.surgeon_row == of.surgeon_row, erased.suture == of.suture)
+    numbers = last.scalar_subquery().label("last"), used.scalar_subquery().label("used")
+    query = select(of.row, of.withdrawn_at, of.outcome, Surgeon.slug, Surgeon.consent, *numbers)
+    found = session.execute(query.join(Surgeon, Surgeon.row == of.surgeon_row).where(of.row.in_(rows)))
+    return {one.row: one for one in found}
+
+
+def find_stored(session: Session, digests: Sequence[str]) -> dict[str, Stored]:
+    """Return those of some policies that are stored, by digest."""
+    query = select(PolicyVersion.sha256, PolicyVersion.row, PolicyVersion.version)
+    found = session.execute(query.where(PolicyVersion.sha256.in_(digests)))
+    return {sha256: Stored(row, version) for sha256, row, version in found}
 
 
 def _refusal(session: Session, learnt: Learnt, state: Any) -> SkillsError | None:
@@ -412,7 +380,7 @@ def _refusal(session: Session, learnt: Learnt, state: Any) -> SkillsError | None
         return NotFound(ERASED)
     if any(one.withdrawn_at is not None for one in (state, *others)):
         return Conflict("A demonstration was withdrawn while the training used it.")
-    marked = [one.outcome for one in (state, *others) if one.outcome not in (None, SUCCESS)]
+    marked = [one.outcome for one in (state, *others) if one.outcome not in (None, models.SUCCESS)]
     if marked and learnt.manifest.outcomes is None:
         why = f"A demonstration was marked {marked[0]} while the training used it."
         return Conflict(why, Remedy(Action.TRAIN_ANY))
@@ -435,13 +403,13 @@ def _version(learnt: Learnt, version: int) -> dict[str, Any]:
     }
 
 
-def _joining(policy: Policy) -> Joining | None:
+def _joining(policy: Policy) -> schemas.Joining | None:
     """Return the joining table of a policy; None by the rule nearest, which every client knows."""
     domain = policy.domain
     if domain.finishes_unjoined:
         return None
     states = np.flatnonzero(domain.joins)
-    return Joining(
+    return schemas.Joining(
         join_share=domain.join_share,
         states=tuple(states.tolist()),
         phases=tuple(domain.joins[states].tolist()),

@@ -14,17 +14,14 @@ from sqlalchemy.orm import Session
 
 from skills.db.models import PolicyVersion, Release, Surgeon
 from skills.db.service_tables import Job, StyleToRetrain
+from skills.library.operation.jobs import TRAINING
 from skills.library.people.consent import refusal
 from skills.library.policies.gate import remedy
-from skills.library.policies.releases import Released, is_served
+from skills.library.policies.releases import Released, Style, is_served
 from skills.schemas import operation as schemas
 from skills.schemas.operation import ServedNow
 from skills.schemas.policies import GateRefusal
 from skills.schemas.training import RetrainedStyle, ServedTraining, StyleComparison, TrainingResult
-
-TRAINING = "training"
-
-Style = tuple[int, str]  # a surgeon's row and a suture type's slug
 
 
 @dataclass(frozen=True)
@@ -97,18 +94,16 @@ def describe_styles(session: Session, styles: Sequence[StyleToRetrain]) -> list[
     """Return styles of a batch, each with the comparison of its version with the released one."""
     serving = _Serving.of(session, {_style(one) for one in styles})
     return [
-        RetrainedStyle.model_construct(
+        RetrainedStyle.from_attributes_of(
+            one,
             surgeon=one.demonstration.surgeon.slug,
             suture=one.demonstration.suture,
             demo=one.demonstration.sha256,
             stale_because=one.stale,
-            state=one.state,
-            reason=one.reason,
             policy_version=None if one.policy is None else one.policy.version,
             sha256=None if one.policy is None else one.policy.sha256,
             comparison=_comparison(one, serving),
             served=serving.served.get(_style(one)),
-            ended_at=one.ended_at,
         )
         for one in styles
     ]

@@ -6,9 +6,13 @@ A pose style belongs to its policy version: it is released, withdrawn, covered b
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from skills.db.models import PolicyVersion
+from skills.demonstration.partner import PartnerMotion
 from skills.errors import NotFound
 from skills.learning.pose_step import PoseStep, next_pose
+from skills.learning.pose_style import PosePath
 from skills.learning.tube import CertifiedPoses, certified_poses
 from skills.library.operation.integrity import posed
 from skills.schemas.pose_styles import NextPose, PartnerPath, PoseStyle
@@ -66,39 +70,26 @@ def poses_of_demonstrations(version: PolicyVersion) -> CertifiedPoses | None:
 
 def describe_pose_style(version: PolicyVersion, poses: CertifiedPoses) -> PoseStyle:
     """Return a pose style as it is served."""
-    path, other = poses.path, poses.path.partner
+    path, other = _lists(poses.path), poses.path.partner
+    of_version = {name: getattr(version, name) for name in ("version", "sha256", "suture", "created_at")}
     partner_motion = None
     if other is not None:
+        motion = _lists(other)
         partner_motion = PartnerPath.model_construct(
-            arm=other.arm,
-            position_mm=other.tip_mm.tolist(),
-            rotation_xyzw=other.rotation_xyzw.tolist(),
-            jaw_rad=None if other.jaw_rad is None else other.jaw_rad.tolist(),
-            scene=poses.partner_scene,
+            **motion | {"position_mm": motion["tip_mm"], "scene": poses.partner_scene}
         )
-    return PoseStyle.model_construct(
-        format=FORMAT,
-        version=version.version,
-        sha256=version.sha256,
-        surgeon=version.surgeon.slug,
-        suture=version.suture,
-        arm=poses.arm,
-        frame=poses.frame,
-        demos=version.manifest.demos,
-        position_mm=path.tip_mm.tolist(),
-        rotation_xyzw=path.rotation_xyzw.tolist(),
-        jaw_rad=None if path.jaw_rad is None else path.jaw_rad.tolist(),
-        elapsed_s=path.elapsed_s.tolist(),
-        spread_mm=path.spread_mm.tolist(),
-        spread_rad=path.spread_rad.tolist(),
-        turn_share=path.turn_share,
-        tick_s=poses.tick_s,
-        tube=poses.tube,
-        scene=poses.scene,
-        partner=poses.partner,
-        partner_motion=partner_motion,
-        created_at=version.created_at,
+    return PoseStyle.model_construct(  # of verified values: checking thousands of poses takes longer than all else
+        **path
+        | vars(poses)
+        | of_version
+        | {"format": FORMAT, "surgeon": version.surgeon.slug, "demos": version.manifest.demos, "tick_s": poses.tick_s}
+        | {"position_mm": path["tip_mm"], "partner_motion": partner_motion}
     )
+
+
+def _lists(value: PosePath | PartnerMotion) -> dict[str, Any]:
+    """Return the fields of a value by their names, arrays as lists."""
+    return {name: one.tolist() if isinstance(one, np.ndarray) else one for name, one in vars(value).items()}
 
 
 def describe_step(poses: CertifiedPoses, step: PoseStep) -> dict[str, Any]:

@@ -10,33 +10,30 @@ the reason; likewise a version whose row has other demonstrations than its manif
 
 import tempfile
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, PolicyVersion, StoredRecording
+from skills.db.models import PolicyVersion, StoredRecording
 from skills.db.packed import digest, seal, unpack_as
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo, partner_motion
 from skills.demonstration.partner import PartnerMotion
 from skills.errors import NotFound
 from skills.formats.parsed import ParsedContent
-from skills.gridworld.grid import GridPath, discretize
+from skills.gridworld.grid import discretize
 from skills.gridworld.reward import sparse_reward
-from skills.learning.certificate import NearLimits, OddsLimits
-from skills.learning.policy import LEARNER_VERSION, Policy, describe_learner
+from skills.learning.policy import LEARNER_VERSION, Policy
 from skills.learning.tube import CertifiedPoses
 from skills.library.operation.integrity import learnt
-from skills.library.operation.jobs import TrainingRequest
 from skills.library.people.consent import refusal
-from skills.library.policies.gate import GATE_VERSION, limits_of
-from skills.library.policies.learning import ANY, Learnt, Lesson, certified, combined_lesson, learn_style, lessons
-from skills.library.policies.training import POSES_VERSION
+from skills.library.policies.gate import GATE_VERSION
+from skills.library.policies.learning import Learnt, Lesson, certified, combined_lesson, learn_style, lessons
+from skills.library.policies.requests import request_of
 from skills.library.recordings.content_cache import alike
 from skills.library.recordings.recordings import Parser, recording_bytes
 from skills.packing import canonical
-from skills.schemas.policies import PolicyManifest
 from skills.settings import Settings
 
 NUMBERS = "its values"
@@ -66,9 +63,10 @@ def compute_again(database: Database, row: int) -> Again:
         version = _found(session, row)
         if (other := _other_learner(version) or _other_demos(version) or _other_gate(version)) is not None:
             return Again(left_out=f"{other}, its certificate was not computed again")
-        stored, found = _Stored.of(version), lessons(session, [one.row for one in version.demonstrations])
-    lesson = stored.lesson(found)
-    return Again(stored.differing(certified(lesson, stored.request, unpack_as(Demo, lesson.demo), stored.policy)))
+        policy, found = learnt(version), lessons(session, [one.row for one in version.demonstrations])
+    lesson = _lesson(version, found)
+    made = certified(lesson, request_of(version.manifest), unpack_as(Demo, lesson.demo), policy)
+    return Again(_differing(version, policy, made))
 
 
 def learn_again(database: Database, row: int, recordings: "StoredRecordings", settings: Settings) -> Again:
@@ -90,23 +88,26 @@ def learn_again(database: Database, row: int, recordings: "StoredRecordings", se
         version = _found(session, row)
         if (other := _other_learner(version) or _other_demos(version)) is not None:
             return Again(left_out=f"{other}, not learnt again")
-        stored, gate = _Stored.of(version), _other_gate(version)
+        policy, gate = learnt(version), _other_gate(version)
         beside = None if version.poses is None else version.poses.poses.path.partner  # its row is checked by itself
-        if stored.policy.network is not None:
+        if policy.network is not None:
             return Again(left_out="learnt by a network, whose values depend on the machine, not learnt again")
         if (refused := refusal(version.surgeon, "training")) is not None:
             return Again(left_out=f"not learnt again: {refused.words()}")
-        cuts = [_Cut.of(one) for one in sorted(version.demonstrations, key=lambda one: one.row)]
         found = lessons(session, [one.row for one in version.demonstrations])
+        cut = {one.row: (one, one.demo, one.path) for one in version.demonstrations}
     differing: list[str] = []
-    for at, cut in enumerate(cuts):
-        demo, path, partner = cut.again(recordings)
-        if (digest(demo), digest(path)) != (cut.demo, cut.path):
-            differing.append(f"its demonstration {cut.sha256[:12]}, cut out of its recording again")
-        reward = sparse_reward(path, stored.policy.levels)
-        found[at] = replace(found[at], demo=seal(demo).packed, reward=seal(reward).packed, partners=(partner,))
-    made = learn_style(stored.lesson(found), stored.request, settings)
-    differing += stored.differing(made, numbers_only=bool(gate))
+    for at, lesson in enumerate(found):
+        shown, stored, in_grid = cut[lesson.row]
+        recording = recordings.read(shown.recording_row).recording
+        demo = cut_demo(recording, arm=stored.arm, topic=stored.topic, start_s=stored.start_s, end_s=stored.end_s)
+        path = discretize(demo.tip_mm, in_grid.grid, in_grid.hysteresis)
+        if (digest(demo), digest(path)) != (digest(stored), digest(in_grid)):
+            differing.append(f"its demonstration {shown.sha256[:12]}, cut out of its recording again")
+        reward, partner = sparse_reward(path, policy.levels), partner_motion(recording, demo)
+        found[at] = replace(lesson, demo=seal(demo).packed, reward=seal(reward).packed, partners=(partner,))
+    made = learn_style(_lesson(version, found), request_of(version.manifest), settings)
+    differing += _differing(version, policy, made, numbers_only=bool(gate))
     if not alike(beside, _beside(made)):
         differing.append(BESIDE)
     return Again(tuple(differing), None if gate is None else f"{gate}, only its values were compared")
@@ -161,82 +162,20 @@ def decoded(database: Database, row: int, tell: Parser) -> ParsedContent:
         return tell(file, **options)
 
 
-@dataclass(frozen=True)
-class _Cut:
-    """Where a demonstration lies in its recording and in its grid, and the digests of both."""
-
-    recording: int
-    sha256: str
-    named: dict[str, Any]
-    of_grid: tuple[Any, float]
-    demo: str
-    path: str
-
-    @classmethod
-    def of(cls, row: Demonstration) -> "_Cut":
-        demo, path = row.demo, row.path
-        named = {name: getattr(demo, name) for name in ("arm", "topic", "start_s", "end_s")}
-        return cls(row.recording_row, row.sha256, named, (path.grid, path.hysteresis), digest(demo), digest(path))
-
-    def again(self, told: StoredRecordings) -> tuple[Demo, GridPath, PartnerMotion | None]:
-        recording = told.read(self.recording).recording
-        demo = cut_demo(recording, **self.named)
-        return demo, discretize(demo.tip_mm, *self.of_grid), partner_motion(recording, demo)
+def _lesson(version: PolicyVersion, found: list[Lesson]) -> Lesson:
+    """Return what a version was learnt from, with the outcomes that its demonstrations had then."""
+    outcomes = version.manifest.outcomes
+    lesson = combined_lesson(found, request_of(version.manifest).combine)
+    return lesson if outcomes is None else replace(lesson, outcomes=tuple(outcomes))
 
 
-@dataclass(frozen=True)
-class _Stored:
-    """A stored version with the request of which it is the result."""
-
-    sha256: str
-    manifest: PolicyManifest
-    policy: Policy
-    request: TrainingRequest
-
-    @classmethod
-    def of(cls, version: PolicyVersion) -> "_Stored":
-        policy = learnt(version)
-        return cls(version.sha256, version.manifest, policy, request_of(version.manifest, policy))
-
-    def lesson(self, found: list[Lesson]) -> Lesson:
-        """Return what the version was learnt from, with the outcomes that its demonstrations had then."""
-        combined, outcomes = self.manifest.combined, self.manifest.outcomes
-        lesson = found[0] if combined is None else combined_lesson(found, combined.kind)
-        return lesson if outcomes is None else replace(lesson, outcomes=tuple(outcomes))
-
-    def differing(self, made: Learnt, *, numbers_only: bool = False) -> tuple[str, ...]:
-        """Return what differs, such as "its values" and "metrics.rmse_mm"."""
-        if made.sha256 == self.sha256:
-            return ()
-        equal = digest(unpack_as(Policy, made.policy)) == digest(self.policy)
-        fields = () if numbers_only else _unequal(self.manifest.digested, made.manifest.digested)
-        return (*(() if equal else (NUMBERS,)), *fields)
-
-
-def request_of(manifest: PolicyManifest, policy: Policy) -> TrainingRequest:
-    """Return the request of which a version is the result, as `training.request_training` writes it."""
-    request: TrainingRequest = {
-        "surgeon": manifest.surgeon,
-        "suture": manifest.suture,
-        "demos": manifest.demos,
-        "learner": describe_learner(manifest.learnt_with),
-        "learner_version": LEARNER_VERSION,
-        "gate": GATE_VERSION,
-        "poses": POSES_VERSION,
-        "near": asdict(limits_of(NearLimits, manifest.grid_certificate.near)),
-        "seed": manifest.seed,
-        "release": False,
-    }
-    if manifest.combined is not None:
-        request["combine"] = {"kind": manifest.combined.kind}
-    if manifest.outcomes is not None:
-        request["outcomes"] = ANY
-    if policy.ties is not None and policy.ties.depth_along is not None:
-        request["depth_along"] = [*policy.ties.depth_along]
-    if policy.surroundings is not None and manifest.scene is not None:
-        request["surroundings"] = policy.surroundings.as_json()
-        request["odds"] = asdict(limits_of(OddsLimits, manifest.scene.near))
-    return request
+def _differing(version: PolicyVersion, policy: Policy, made: Learnt, *, numbers_only: bool = False) -> tuple[str, ...]:
+    """Return in what a result differs from the stored version, such as "its values" and "metrics.rmse_mm"."""
+    if made.sha256 == version.sha256:
+        return ()
+    equal = digest(unpack_as(Policy, made.policy)) == digest(policy)
+    fields = () if numbers_only else _unequal(version.manifest.digested, made.manifest.digested)
+    return (*(() if equal else (NUMBERS,)), *fields)
 
 
 def _other_gate(version: PolicyVersion) -> str | None:

@@ -16,9 +16,8 @@ job takes its result from here: `released` and `now_released` are the present st
 job.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
-from itertools import groupby
 from typing import Any, NamedTuple
 
 from sqlalchemy import (
@@ -56,6 +55,8 @@ from skills.library.policies.fit import compare_versions, format_mm, not_worse
 from skills.library.policies.gate import join_reasons, remedy
 from skills.planning.plan import CONSTANT_TURN_DEG, departure_of
 from skills.schemas.policies import GateRefusal
+
+Style = tuple[int, str]  # a surgeon's row and a suture type's slug
 
 
 def _newest_leaf(table: type[Release | Surgeon]) -> ScalarSelect[Any]:
@@ -123,6 +124,14 @@ def serves(session: Session, policy: PolicyVersion) -> bool:
     return now is not None and now.policy_row == policy.row
 
 
+def served_versions(session: Session, styles: Collection[Style]) -> dict[Style, PolicyVersion]:
+    """Return the versions that some styles serve, with one statement; styles that serve nothing are left out."""
+    query = select(PolicyVersion).join(Release, Release.policy_row == PolicyVersion.row)
+    mine = Release.surgeon_row.in_({who for who, _ in styles}), Release.suture.in_({suture for _, suture in styles})
+    found = session.scalars(query.where(*mine, is_served()))
+    return {(one.surgeon_row, one.suture): one for one in found}
+
+
 def shares_served(session: Session, suture: str) -> dict[str, float]:
     """Return the mean share of the demonstration that the starts of each served policy follow, by surgeon."""
     share = type_coerce(PolicyVersion.manifest, JSON)["coverage", "mean_share"]
@@ -163,25 +172,10 @@ def release(
         Corrupt: The stored policy does not match its digest.
     """
     consent.require(policy.surgeon, "training")
-    released, reasons = _release(session, policy, actor, constant_turn_deg)
-    if released is None:
-        raise _not_releasable(policy, reasons)
-    return released
-
-
-def _not_releasable(policy: PolicyVersion, reasons: Sequence[GateRefusal]) -> Conflict:
-    text = f"Version {policy.version} cannot be released: {join_reasons(reasons)}."
-    return Conflict(text, reasons=[one.text for one in reasons])
-
-
-def _release(
-    session: Session, policy: PolicyVersion, actor: str, constant_turn_deg: float
-) -> tuple[Release | None, list[GateRefusal]]:
-    """Release a version that consent covers; return its release, or None and the reasons against it."""
     learnt(policy)
     served = in_force(session, policy.surgeon_row, policy.suture)
     if served and served[0].policy_row == policy.row:
-        return served[0], []
+        return served[0]
     reasons = [*policy.manifest.grid_certificate.refused_because, *changed_demonstrations(policy)]
     reasons += _held(policy, constant_turn_deg)
     # Only phased policies have to reproduce their demonstration; one of the cell state must at least not be worse.
@@ -194,13 +188,14 @@ def _release(
             )
             reasons.append(GateRefusal("worse", text))
     if reasons or not policy.releasable:
-        return None, reasons
+        text = f"Version {policy.version} cannot be released: {join_reasons(reasons)}."
+        raise Conflict(text, remedy(reasons), reasons=[one.text for one in reasons])
     released = Release(policy=policy, surgeon_row=policy.surgeon_row, suture=policy.suture, released_by=actor)
     session.add(released)
     record_event(session, actor, "release", "policy-version", policy.sha256, policy.surgeon)
     session.flush()
     announce(session)
-    return released, []
+    return released
 
 
 class Released(NamedTuple):
@@ -218,9 +213,10 @@ def try_release(session: Session, policy: PolicyVersion, actor: str) -> Released
     """Release a policy version if it passes the gate, as `release` does; return why it was not released."""
     if (without := consent.refusal(policy.surgeon, "training")) is not None:
         return Released(False, without.words(), remedy([GateRefusal("consent", without.message)]))
-    released, reasons = _release(session, policy, actor, CONSTANT_TURN_DEG)
-    if released is None:
-        return Released(False, _not_releasable(policy, reasons).words(), remedy(reasons))
+    try:
+        release(session, policy, actor)
+    except Conflict as refused:
+        return Released(False, refused.message, " ".join(refused.advice(None)))
     return Released(True, None, None)
 
 
@@ -266,23 +262,23 @@ def withdraw_all(session: Session, surgeon: Surgeon, actor: str) -> list[Release
     return releases
 
 
-def withdraw_resting_on(session: Session, demonstration: Demonstration, actor: str) -> list[Release]:
-    """Withdraw the releases learnt from a demonstration; if the served one is among them, all of the style."""
-    releases = in_force(session, demonstration.surgeon_row, demonstration.suture)
-    withdrawn = _with_superseded(releases, [r for r in releases if demonstration in r.policy.demonstrations])
-    _withdraw(session, withdrawn, actor)
-    return withdrawn
+def withdraw_resting_on(
+    session: Session, demonstration: Demonstration, actor: str, *, marked: bool = False
+) -> list[Release]:
+    """Withdraw the releases learnt from a demonstration; if the served one is among them, all of the style.
 
-
-def withdraw_failed(session: Session, demonstration: Demonstration, actor: str) -> None:
-    """Withdraw, as `withdraw_resting_on`, releases learnt from a demonstration that is marked recovery or failure.
-
-    Those of versions that were trained from any outcome stay, unless they were superseded by one that is withdrawn.
+    Args:
+        session: The caller's transaction.
+        demonstration: It is withdrawn or erased, or was marked recovery or failure.
+        actor: The actor of the events.
+        marked: It was marked: the releases of versions that were trained from any outcome stay.
     """
     releases = in_force(session, demonstration.surgeon_row, demonstration.suture)
     resting = [one for one in releases if demonstration in one.policy.demonstrations]
-    failed = [one for one in resting if not one.policy.of_any_outcome]
-    _withdraw(session, _with_superseded(releases, failed), actor)
+    ending = [one for one in resting if not (marked and one.policy.of_any_outcome)]
+    withdrawn = _with_superseded(releases, ending)
+    _withdraw(session, withdrawn, actor)
+    return withdrawn
 
 
 def withdraw_policies(session: Session, ended: Mapping[str, datetime], actor: str) -> None:
@@ -294,14 +290,11 @@ def withdraw_policies(session: Session, ended: Mapping[str, datetime], actor: st
         actor: The actor of the events.
     """
     query = select(Release, PolicyVersion.sha256).join(PolicyVersion, PolicyVersion.row == Release.policy_row)
-    query = query.where(Release.withdrawn_at.is_(None))
-    query = query.order_by(Release.surgeon_row, Release.suture, Release.row.desc())
-    withdrawn: list[Release] = []
-    for _, style in groupby(session.execute(query), key=lambda one: (one[0].surgeon_row, one[0].suture)):
-        named = [(one, policy) for one, policy in style]
-        ending = [one for one, policy in named if policy in ended and one.released_at <= ended[policy]]
-        withdrawn += _with_superseded([one for one, _ in named], ending)
-    _withdraw(session, withdrawn, actor)
+    found = session.execute(query.where(Release.withdrawn_at.is_(None)))
+    over = [one for one, sha256 in found if sha256 in ended and one.released_at <= ended[sha256]]
+    for style in sorted({(one.surgeon_row, one.suture) for one in over}):
+        releases = in_force(session, *style)
+        _withdraw(session, _with_superseded(releases, [one for one in releases if one in over]), actor)
 
 
 def _with_superseded(releases: Sequence[Release], ending: list[Release]) -> list[Release]:

@@ -5,8 +5,7 @@
 
 import secrets
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Text, cast, func, insert, select, update
 from sqlalchemy.orm import Session
@@ -16,25 +15,22 @@ from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
-from skills.learning.certificate import NearLimits, OddsLimits
-from skills.learning.policy import LEARNER_VERSION, describe_learner, learner_of
 from skills.library.operation import jobs, locks
-from skills.library.operation.jobs import (
-    BATCH,
-    JOIN_AS_SERVED,
-    PART,
-    PartRequest,
-    RequestedJob,
-    RetrainingRequest,
-    did_nothing,
-)
+from skills.library.operation.jobs import BATCH, PART, PartRequest, RequestedJob
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
-from skills.library.policies.gate import GATE_VERSION, limits_of
-from skills.library.policies.outcomes import Style
-from skills.library.policies.served_settings import ServedSettings, in_pieces, learner_for, settings_of_served
-from skills.library.policies.training import POSES_VERSION, learner_to_train
+from skills.library.policies.gate import DEFAULT_LIMITS, GateLimits
+from skills.library.policies.releases import Style
+from skills.library.policies.requests import (
+    JOIN_AS_SERVED,
+    RetrainingRequest,
+    TrainingRequest,
+    in_pieces,
+    request_of,
+    requests_of_served,
+)
+from skills.library.policies.training import learner_to_train
 from skills.library.recordings.demos import newest_demos
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
@@ -47,11 +43,7 @@ FEWEST_PARTS = 16  # if there are so many styles: workers share a batch part by 
 
 
 def request_retraining(
-    database: Database,
-    batch: RetrainingIn,
-    actor: str,
-    near: NearLimits | None = None,
-    odds: OddsLimits | None = None,
+    database: Database, batch: RetrainingIn, actor: str, limits: GateLimits = DEFAULT_LIMITS
 ) -> RequestedJob:
     """Queue a batch that trains styles again, each from its newest demonstration that may be learnt from.
 
@@ -78,8 +70,7 @@ def request_retraining(
         batch: The request. Without `surgeon` or `suture` styles of all of them are trained, and without `learner` phase
             Q-learning with its defaults learns.
         actor: The owner of the caller's key.
-        near: The gate's limit at the starts near the demonstrated one; None for its defaults.
-        odds: The gate's limits in a scene; None for their defaults.
+        limits: The gate's limits.
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
@@ -89,13 +80,14 @@ def request_retraining(
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
     with database.reading() as session:
-        request, styles = choose_styles(session, batch, near, odds)
+        request, styles = choose_styles(session, batch, limits)
     names = [] if batch.surgeon is None else [locks.surgeon(batch.surgeon)]
     with database.writing([locks.BATCHES, *names]) as session:
         who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
-        job, new = jobs.ask(session, BATCH, request, who, actor)
-        if not new:
-            return RequestedJob(job, False, _did_nothing(session, job))
+        requested = jobs.ask(session, request, who, actor)
+        job = requested.job
+        if not requested.new:
+            return requested if job.state != "succeeded" or not request.release else _done_before(session, job)
     # Rows are inserted only for a new job; an equal one has its own.
     size = max(1, min(MOST_IN_A_PART, -(-len(styles) // FEWEST_PARTS)))
     at_once = STYLES_AT_ONCE // size * size
@@ -103,7 +95,7 @@ def request_retraining(
         with database.writing([locks.job(job.row)]) as session:
             if session.scalar(select(Job.row).where(Job.row == job.row, Job.state.in_(jobs.ACTIVE))) is None:
                 break  # cancelled or erased meanwhile
-            _divide(session, job, styles[first : first + at_once], size)
+            _divide(session, job, [*styles.items()][first : first + at_once], size)
     with database.writing([locks.job(job.row)]) as session:
         session.execute(update(Job).where(Job.row == job.row).values(submitted_at=now()), **jobs.UNSYNCHRONISED)
         jobs.settle(session, job.row)  # a batch without styles, or whose styles are all done, ends here
@@ -113,14 +105,14 @@ def request_retraining(
     if not styles:
         return RequestedJob(told, True, "Nothing: no style needs training.")
     counted = f"{len(styles)} {'style' if len(styles) == 1 else 'styles'}"
-    why = " that serve another version than when an equal batch ended" if "after" in request else ""
+    why = " that serve another version than when an equal batch ended" if request.after else ""
     return RequestedJob(told, True, f"A new job is queued, of {counted}{why}.")
 
 
 def choose_styles(
-    session: Session, batch: RetrainingIn, near: NearLimits | None = None, odds: OddsLimits | None = None
-) -> tuple[RetrainingRequest, list[dict[str, Any]]]:
-    """Return the request of a batch's job, and for each of its styles the demonstration and why it is stale.
+    session: Session, batch: RetrainingIn, limits: GateLimits = DEFAULT_LIMITS
+) -> tuple[RetrainingRequest, dict[int, list[str]]]:
+    """Return the request of a batch's job, and by the demonstration of each of its styles why it is stale.
 
     The arguments and errors are those of `request_retraining`.
     """
@@ -134,64 +126,60 @@ def choose_styles(
         add = Remedy(Action.ADD_DEMO, surgeon=batch.surgeon or "SURGEON", suture=batch.suture or "SUTURE")
         why = "There is no active demonstration of the requested styles; one marked recovery or failure does not count."
         raise Conflict(why, add)
-    asked: RetrainingRequest = {
-        "surgeon": batch.surgeon,
-        "suture": batch.suture,
-        "only_stale": batch.only_stale,
-        "learner": describe_learner(learner),
-        "learner_version": LEARNER_VERSION,
-        "gate": GATE_VERSION,
-        "poses": POSES_VERSION,
-        "near": asdict(near or NearLimits()),
-        "odds": asdict(odds or OddsLimits()),
-        "joins": JOIN_AS_SERVED if batch.chosen is None else None,
-        "seed": 0,
-        "release": batch.release,
-    }
-    served = settings_of_served(session, None if who is None else [who.row])
-    stale = _reasons(session, demos, asked, served, who, what)
-    chosen = [demo for demo in demos if stale[demo.row] or not batch.only_stale]
-    request, unsettled = _unsettled(session, asked, chosen, served)
-    return request, [{"demonstration_row": demo.row, "stale": stale[demo.row]} for demo in unsettled]
+    asked = RetrainingRequest(
+        surgeon=batch.surgeon,
+        suture=batch.suture,
+        only_stale=batch.only_stale,
+        learner=learner,
+        near=limits.near,
+        odds=limits.odds,
+        joins=JOIN_AS_SERVED if batch.chosen is None else None,
+        release=batch.release,
+    )
+    served = requests_of_served(session, None if who is None else [who.row])
+    trainings = {demo.row: _training_of(session, demo, asked, served.get(demo.style)) for demo in demos}
+    stale = _reasons(session, demos, trainings, asked, _styles(PolicyVersion, who, what))
+    chosen = [demo.row for demo in demos if stale[demo.row] or not batch.only_stale]
+    request, unsettled = _unsettled(session, asked, chosen, trainings)
+    return request, {row: stale[row] for row in unsettled}
+
+
+def _training_of(
+    session: Session, demo: "_Newest", asked: RetrainingRequest, served: TrainingRequest | None
+) -> TrainingRequest:
+    """Return the training of a style: of its newest demonstration, or of as many as its served policy combines."""
+    demos = [demo.sha256]
+    if served is not None and served.combine is not None:
+        newest = newest_demos(session, demo.surgeon_row, demo.suture, len(served.demos))
+        demos = [one.sha256 for one in newest]
+    return asked.training_of((demo.surgeon, demo.suture), demos, served)
 
 
 def _unsettled(
-    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], served: dict[Style, ServedSettings]
-) -> tuple[RetrainingRequest, Sequence["_Newest"]]:
-    """Return the request to make, and its styles; if an equal batch is done, only the styles that it would now release.
+    session: Session, asked: RetrainingRequest, chosen: Sequence[int], trainings: dict[int, TrainingRequest]
+) -> tuple[RetrainingRequest, Sequence[int]]:
+    """Return the request to make, and the demonstrations of its styles.
 
-    `after` names that batch, so that the request differs from it, while a repetition of the request does not differ.
+    If an equal batch is done, these are only the styles that it would now release. `after` names that batch, so that
+    the request differs from it, while a repetition of the request does not differ.
     """
     while True:
-        digest = sha256(canonical([_made_of(session, demo, served.get(demo.style), asked) for demo in chosen]))
-        request: RetrainingRequest = {**asked, "styles": len(chosen), "demos_sha256": digest}
-        known = jobs.find_live(session, BATCH, request)
-        if known is None or known.state != "succeeded" or not asked["release"]:
+        digest = sha256(canonical([trainings[row].stored for row in chosen]))
+        request = asked.model_copy(update={"styles": len(chosen), "demos_sha256": digest})
+        known = jobs.find_live(session, request)
+        if known is None or known.state != "succeeded" or not asked.release:
             return request, chosen
         left = jobs.changed_since(session, known.row)
         if not left:
             return request, chosen
-        chosen = [demo for demo in chosen if demo.row in left]
-        asked = {**asked, "after": known.id}
+        chosen = [row for row in chosen if row in left]
+        asked = asked.model_copy(update={"after": known.id})
 
 
-def _made_of(session: Session, demo: "_Newest", served: ServedSettings | None, asked: RetrainingRequest) -> list[Any]:
-    """Return the combination of a style, the digests of its newest demonstrations, its rule and its scene."""
-    if served is None:
-        return [None, [demo.sha256], None, None]
-    kind, demos = None, [demo.sha256]
-    if served.combining is not None:
-        kind, newest = served.combining, newest_demos(session, demo.surgeon_row, demo.suture, served.demos)
-        demos = [one.sha256 for one in newest]
-    rule = served.join_share if asked["joins"] == JOIN_AS_SERVED else None
-    return [kind, demos, rule, None if served.surroundings is None else served.surroundings.as_json()]
-
-
-def _did_nothing(session: Session, job: Job) -> str:
-    if job.state != "succeeded" or not job.request["release"]:
-        return did_nothing(job)
+def _done_before(session: Session, job: Job) -> RequestedJob:
     serving, done = jobs.count_serving(session, job.row)
-    return f"Nothing: an equal batch trained {done} styles, and {serving} of them serve its version, as when it ended."
+    did = f"Nothing: an equal batch trained {done} styles, and {serving} of them serve its version, as when it ended."
+    return RequestedJob(job, False, did)
 
 
 @dataclass(frozen=True)
@@ -201,6 +189,7 @@ class _Newest:
     row: int
     sha256: str
     surgeon_row: int
+    surgeon: str
     suture: str
 
     @property
@@ -213,8 +202,8 @@ def _newest_demos(session: Session, surgeon: Surgeon | None, suture: SutureType 
     of = Demonstration
     newest = select(func.max(of.row)).where(of.learnable, *_styles(of, surgeon, suture))
     newest = newest.group_by(of.surgeon_row, of.suture)
-    query = select(of.row, of.sha256, of.surgeon_row, of.suture).where(of.row.in_(newest)).order_by(of.row)
-    return [_Newest(*row) for row in session.execute(query)]
+    query = select(of.row, of.sha256, of.surgeon_row, Surgeon.slug, of.suture).join(Surgeon)
+    return [_Newest(*row) for row in session.execute(query.where(of.row.in_(newest)).order_by(of.row))]
 
 
 def _styles(
@@ -228,19 +217,18 @@ def _styles(
 def _reasons(
     session: Session,
     demos: Sequence[_Newest],
+    trainings: dict[int, TrainingRequest],
     asked: RetrainingRequest,
-    served: dict[Style, ServedSettings],
-    surgeon: Surgeon | None,
-    suture: SutureType | None,
+    styles: list[ColumnElement[bool]],
 ) -> dict[int, list[str]]:
     """Return, by demonstration, why its style's newest version is stale; an empty list if it is up to date.
 
-    It is up to date if it was learnt from this demonstration with these settings and this learner, in the scene of the
-    served version, not refused by an older gate, and checked with the same limits at the near starts.
+    It is up to date if it was learnt from this demonstration with the settings of the training that would be made, in
+    the same scene, not refused by an older gate, and checked with the same limits.
     """
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
-    newest = last.where(*_styles(of, surgeon, suture)).subquery()
+    newest = last.where(*styles).subquery()
     query = select(of.surgeon_row, of.suture, of.releasable, cast(of.manifest, Text)).join(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
@@ -251,49 +239,48 @@ def _reasons(
         demo = of_style.get((who, what))
         if demo is None:
             continue
-        manifest, kept = PolicyManifest.model_validate_json(text), served.get((who, what))
-        certificate, near = manifest.grid_certificate, NearLimits(**asked["near"])
-        learner = learner_of(learner_for(asked, kept))
-        odds = None if manifest.scene is None else manifest.scene.near
+        manifest = PolicyManifest.model_validate_json(text)
+        made, wanted = request_of(manifest), trainings[demo.row]
         found = {
-            "a newer demonstration": demo.sha256 not in manifest.demos,
-            "another scene": manifest.surroundings != (None if kept is None else kept.surroundings),
-            "other settings": (manifest.learnt_with, manifest.seed) != (learner, asked["seed"]),
-            "a newer learner": manifest.learner_version != asked["learner_version"],
-            "refused by an older gate": not releasable and certificate.gate != asked["gate"],
-            "other limits at the near starts": limits_of(NearLimits, certificate.near) != near
-            or (odds is not None and limits_of(OddsLimits, odds) != OddsLimits(**asked["odds"])),
+            "a newer demonstration": demo.sha256 not in made.demos,
+            "another scene": made.surroundings != wanted.surroundings,
+            "other settings": (made.learner, made.seed) != (wanted.learner, wanted.seed),
+            "a newer learner": manifest.learner_version != wanted.learner_version,
+            "refused by an older gate": not releasable and manifest.grid_certificate.gate != wanted.gate,
+            "other limits at the near starts": made.near != wanted.near or made.odds not in (None, asked.odds),
         }
         reasons[demo.row] = [reason for reason, holds in found.items() if holds]
     return reasons
 
 
-def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]], size: int) -> None:
+def _divide(session: Session, job: Job, styles: Sequence[tuple[int, list[str]]], size: int) -> None:
     """Insert a row for each of some styles, and divide them into parts; a demonstration that was erased is left out."""
-    demos = [style["demonstration_row"] for style in styles]
+    demos = [row for row, _ in styles]
     there = set(session.scalars(select(Demonstration.row).where(Demonstration.row.in_(demos))))
-    left = [style for style in styles if style["demonstration_row"] in there]
-    parts = [_new_part(job) for _ in range(0, len(left), size)]
+    left = [(row, stale) for row, stale in styles if row in there]
+    parts = [
+        # without its request and identity, which name its row
+        Job(
+            id=(name := secrets.token_hex(8)),
+            kind=PART,
+            identity=sha256(name.encode()),
+            request={},
+            surgeon_row=job.surgeon_row,
+            requested_by=job.requested_by,
+        )
+        for _ in range(0, len(left), size)
+    ]
     session.add_all(parts)
     session.flush()
     rows = []
     for number, part in enumerate(parts):
-        request: PartRequest = {"retraining": job.row, "part": part.row}
-        part.request, part.identity = {**request}, jobs.identity_of(PART, request)
-        rows += [{"job_row": job.row, "part_row": part.row, **style} for style in left[number * size :][:size]]
+        request = PartRequest(retraining=job.row, part=part.row)
+        part.request, part.identity = request.stored, request.identity
+        rows += [
+            {"job_row": job.row, "part_row": part.row, "demonstration_row": row, "stale": stale}
+            for row, stale in left[number * size :][:size]
+        ]
     session.execute(insert(StyleToRetrain), rows)
-
-
-def _new_part(job: Job) -> Job:
-    """Return a part of a batch without its request, which names the part's row."""
-    return Job(
-        id=(name := secrets.token_hex(8)),
-        kind=PART,
-        identity=jobs.identity_of(PART, {"retraining": job.id, "part": name}),
-        request={},
-        surgeon_row=job.surgeon_row,
-        requested_by=job.requested_by,
-    )
 
 
 def find_retraining(session: Session, job_id: str) -> Job:

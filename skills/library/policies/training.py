@@ -9,59 +9,39 @@ Learning and certifying run outside any transaction; the result is packed before
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict
-from typing import Any
 
 from sqlalchemy.orm import Session
 
-from skills.db.models import (
-    PolicyVersion,
-    Surgeon,
-)
+from skills.db.models import PolicyVersion, Surgeon
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.deep import require_installed
 from skills.errors import BadInput
 from skills.gridworld.hazards import refuse_unfit
 from skills.gridworld.reward import RewardLevels
-from skills.learning.certificate import (
-    NearLimits,
-    OddsLimits,
-)
 from skills.learning.in_scene import scene_learner
-from skills.learning.policy import (
-    LEARNER_VERSION,
-    Learner,
-    describe_learner,
-    refuse_loops,
-    refuse_too_large,
-)
+from skills.learning.policy import Learner, refuse_loops, refuse_too_large
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.ties import rule_in
 from skills.library.operation import jobs
-from skills.library.operation.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
+from skills.library.operation.jobs import RequestedJob, Store
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
 from skills.library.policies.combined import BEST, choose_demos
-from skills.library.policies.gate import GATE_VERSION
-from skills.library.policies.learning import ANY, combined_lesson, learn_style, lessons, store_style, with_partners
+from skills.library.policies.gate import DEFAULT_LIMITS, GateLimits
+from skills.library.policies.learning import combined_lesson, learn_style, lessons, store_style, with_partners
+from skills.library.policies.requests import ANY, TrainingRequest
 from skills.library.policies.versions import find_by_digest
 from skills.library.recordings.demos import find_demo
 from skills.library.recordings.recordings import confined_reader
 from skills.schemas.training import TrainingIn, TrainingResult
 from skills.settings import Settings
 
-POSES_VERSION = 1  # part of a training's identity: raise it when equal demonstrations give another pose style
-
 
 def request_training(
-    session: Session,
-    training: TrainingIn,
-    actor: str,
-    near: NearLimits | None = None,
-    odds: OddsLimits | None = None,
+    session: Session, training: TrainingIn, actor: str, limits: GateLimits = DEFAULT_LIMITS
 ) -> RequestedJob:
     """Queue the training of a style, with all defaults resolved.
 
@@ -74,8 +54,7 @@ def request_training(
         training: The request. Without `demos` the newest demonstration of the style is meant that may be learnt from,
             without `combine` `BEST`, and without `learner` phase Q-learning with its defaults.
         actor: The owner of the caller's key.
-        near: The gate's limit at the starts near the demonstrated one; None for its defaults.
-        odds: The gate's limits in a scene; None for their defaults.
+        limits: The gate's limits.
 
     Raises:
         NotFound: The surgeon, the suture type or a demonstration is unknown.
@@ -87,17 +66,14 @@ def request_training(
             scene is in another frame or is touched by the demonstration, or the learner does not learn in a scene.
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
-    request, who = training_request(session, training, near, odds)
-    job, new = jobs.ask(session, "training", request, who, actor)
-    if new:
-        return RequestedJob(job, True, QUEUED)
-    again = training.release and job.state == "succeeded"
-    return RequestedJob(job, False, _release_again(session, job, actor) if again else did_nothing(job))
+    request, who = training_request(session, training, limits)
+    requested = jobs.ask(session, request, who, actor)
+    if requested.new or not training.release or requested.job.state != "succeeded":
+        return requested
+    return requested._replace(did=_release_again(session, requested.job, actor))
 
 
-def training_request(
-    session: Session, training: TrainingIn, near: NearLimits | None = None, odds: OddsLimits | None = None
-) -> tuple[TrainingRequest, Surgeon]:
+def training_request(session: Session, training: TrainingIn, limits: GateLimits) -> tuple[TrainingRequest, Surgeon]:
     """Return the request of a training's job with all defaults resolved, and the surgeon; see `request_training`."""
     learner = learner_to_train(training.chosen)
     who, what = find_surgeon(session, training.surgeon), find_suture_type(session, training.suture)
@@ -106,37 +82,33 @@ def training_request(
     chosen = choose_demos(session, who, what.slug, training.demos, any_outcome=any_outcome)
     # Before the job is queued, so that the caller sees the error at once.
     refuse_too_large(chosen[-1].path, learner, in_scene=training.scene is not None)
-    request: TrainingRequest = {
-        "surgeon": who.slug,
-        "suture": what.slug,
-        "demos": [demo.sha256 for demo in chosen],
-        "learner": describe_learner(learner),
-        "learner_version": LEARNER_VERSION,
-        "gate": GATE_VERSION,
-        "poses": POSES_VERSION,
-        "near": asdict(near or NearLimits()),
-        "seed": training.seed,
-        "release": training.release,
-    }
-    if len(chosen) > 1:
-        request["combine"] = {"kind": training.combining or BEST}
-    elif training.combining is not None:
+    combine = training.combine or (BEST if len(chosen) > 1 else None)
+    if combine is not None and len(chosen) == 1:
         raise BadInput("A single demonstration is not combined; name several in `demos`, or omit `combine`.")
-    if any_outcome:
-        request["outcomes"] = ANY
     if training.depth_along is not None:
         _refuse_depth_along(training.depth_along, learner, chosen[-1].frame)
-        request["depth_along"] = list(training.depth_along)
     if (surroundings := training.surroundings) is not None:
         scene_learner(learner)
         if training.depth_along is not None:
             raise BadInput("In a scene depths are not compared, but have a cost; omit `depth_along`.")
         for demo in chosen:
             refuse_unfit(surroundings.scene, demo.path, demo.frame)
-        request["surroundings"] = surroundings.as_json()
-        request["odds"] = asdict(odds or OddsLimits())
     elif training.scene_costs is not None:
         raise BadInput("scene_costs are costs of a scene; give the scene too, or omit them.")
+    request = TrainingRequest(
+        surgeon=who.slug,
+        suture=what.slug,
+        demos=[demo.sha256 for demo in chosen],
+        learner=learner,
+        near=limits.near,
+        odds=None if surroundings is None else limits.odds,
+        seed=training.seed,
+        release=training.release,
+        combine=combine,
+        outcomes=ANY if any_outcome else None,
+        depth_along=training.depth_along,
+        surroundings=surroundings,
+    )
     return request, who
 
 
@@ -151,16 +123,6 @@ def learner_to_train(chosen: Learner | None) -> Learner:
     refuse_loops(RewardLevels(), learner)  # those of every demonstration that is added
     require_installed(learner)
     return learner
-
-
-def near_limits(settings: Settings) -> NearLimits:
-    """Return the gate's limit at the starts near the demonstrated one, as an installation sets it."""
-    return NearLimits(settings.near_radius_mm, settings.near_least_share)
-
-
-def odds_limits(settings: Settings) -> OddsLimits:
-    """Return the gate's limits in a scene, as an installation sets them."""
-    return OddsLimits(settings.scene_least_finishing, settings.scene_most_touching)
 
 
 def _refuse_depth_along(depth_along: Sequence[float], learner: Learner, frame: str) -> None:
@@ -187,25 +149,24 @@ def _release_again(session: Session, job: Job, actor: str) -> str:
     return f"Version {version.version} was released." if because is None else f"Nothing: {because}"
 
 
-def train_style(database: Database, request: TrainingRequest, settings: Settings) -> Store:
+def train_style(database: Database, request: TrainingRequest, settings: Settings) -> Store[TrainingResult]:
     """Learn, certify and measure the requested style; the returned function stores the result."""
     with database.reading() as session:
-        found = lessons(session, [find_demo(session, one).row for one in request["demos"]])
+        found = lessons(session, [find_demo(session, one).row for one in request.demos])
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if a recording is not cached
         found = with_partners(database, found, reader.parse)
-    lesson = combined_lesson(found, request["combine"]["kind"]) if "combine" in request else found[0]
-    learnt = learn_style(lesson, request, settings, jobs.progress_callback(database, "training", request))
+    lesson = combined_lesson(found, request.combine)
+    learnt = learn_style(lesson, request, settings, jobs.progress_callback(database, request))
 
-    def store(session: Session, actor: str) -> dict[str, Any]:
+    def store(session: Session, actor: str) -> TrainingResult:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)
-        wanted = request["release"]
-        released = releases.try_release(session, version, actor) if wanted else releases.NOT_REQUESTED
+        released = releases.try_release(session, version, actor) if request.release else releases.NOT_REQUESTED
         return TrainingResult(
             policy_version=version.version,
             sha256=version.sha256,
             releasable=version.releasable,
             **released._asdict(),
-        ).model_dump()
+        )
 
     return store

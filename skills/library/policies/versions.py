@@ -1,7 +1,6 @@
 """Policy versions of a style: the served one, the history, and finding one."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session, selectinload
@@ -16,16 +15,8 @@ from skills.library.policies import releases
 from skills.remedies import Action, Remedy
 
 
-@dataclass(frozen=True)
-class Served:
-    """The policy version that a style serves, and its release."""
-
-    policy: PolicyVersion
-    release: Release
-
-
-def policy_of(session: Session, surgeon: str, suture: str) -> Served:
-    """Return the policy version that a style serves.
+def served_release(session: Session, surgeon: str, suture: str) -> Release:
+    """Return the release of the policy version that a style serves.
 
     Raises:
         NotFound: The surgeon or suture type is unknown, or nothing is served; the error then lists the candidates.
@@ -35,7 +26,7 @@ def policy_of(session: Session, surgeon: str, suture: str) -> Served:
     served = releases.served(session, who, what.slug)
     if served is not None:
         releases.refuse_edited_release(session, served)
-        return Served(served.policy, served)
+        return served
     # Without candidates: no version of this surgeon may be released.
     refused = consent.refusal(who, "training")
     if refused is not None:
@@ -128,7 +119,7 @@ def choose(session: Session, surgeon: str, suture: str, version: int | None) -> 
     """
     if version is not None:
         return followable(find_version(session, surgeon, suture, version))
-    return policy_of(session, surgeon, suture).policy
+    return served_release(session, surgeon, suture).policy
 
 
 def followable(policy: PolicyVersion) -> PolicyVersion:
@@ -139,6 +130,3 @@ def followable(policy: PolicyVersion) -> PolicyVersion:
     """
     consent.require(policy.surgeon, "training")
     return policy
-
-
-# ---- policies learnt from several demonstrations -------------------------------------------------------------------

@@ -21,7 +21,7 @@ from json import load
 from shutil import copyfileobj
 from tempfile import TemporaryFile
 from time import monotonic
-from typing import IO, Any, NamedTuple, cast
+from typing import IO, Any, ClassVar, Literal, NamedTuple, cast
 from zipfile import ZipFile, ZipInfo
 
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, insert, or_, select
@@ -45,7 +45,7 @@ from skills.formats.lerobot.writer import (
 )
 from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest
-from skills.library.operation.jobs import EXPORT, UNSYNCHRONISED, DatasetRequest, Store
+from skills.library.operation.jobs import EXPORT, UNSYNCHRONISED, JobRequest, RequestedJob, Store
 from skills.library.people import consent
 from skills.library.people.recorded import RECORDED, episodes_of, overlap, recorded_in
 from skills.library.people.surgeons import find_surgeon
@@ -55,6 +55,7 @@ from skills.library.recordings.recordings import Parser, confined_reader, stored
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.datasets import DatasetEpisode, DatasetEpisodes, DatasetIn
+from skills.schemas.results import DatasetResult
 from skills.settings import Settings
 
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once
@@ -68,6 +69,25 @@ EPISODE = (_DEMOS.c.recording_row, _DEMOS.c.surgeon_row, _DEMOS.c.start_s, _DEMO
 # ---- request -------------------------------------------------------------------------------------------------------
 
 
+class DatasetRequest(JobRequest):
+    """The request of an export's job: the contents of its README, and the digest of its demonstrations and splits."""
+
+    kind: ClassVar[str] = EXPORT
+
+    name: str
+    version: Version
+    fps: int
+    arms: list[str]
+    whole: bool
+    split: Literal["surgeon", "session"]
+    licence: str
+    description: str
+    procedure: str
+    consent: str  # as sentences, without a pseudonym
+    episodes: int
+    demos_sha256: str
+
+
 class _Chosen(NamedTuple):
     """A demonstration to export: as few of its columns as needed, because there may be many."""
 
@@ -79,8 +99,8 @@ class _Chosen(NamedTuple):
     outcome: str | None
 
 
-def request_dataset(session: Session, asked: DatasetIn, actor: str) -> tuple[Job, bool]:
-    """Queue an export, with all defaults resolved; return the job, and whether it is new.
+def request_dataset(session: Session, asked: DatasetIn, actor: str) -> RequestedJob:
+    """Queue an export, with all defaults resolved.
 
     Args:
         session: The caller's transaction.
@@ -99,28 +119,20 @@ def request_dataset(session: Session, asked: DatasetIn, actor: str) -> tuple[Job
     arms = _arms(session, chosen, asked.arms)
     recorded = recorded_in(session, episodes_of([one.row for one in chosen], whole=asked.whole))
     recorded.require("export", {one.surgeon_row for one in chosen})
-    request: DatasetRequest = {
-        "name": asked.name,
-        "version": asked.version,
-        "fps": asked.fps,
-        "arms": arms,
-        "whole": asked.whole,
-        "split": asked.split,
-        "licence": asked.licence,
-        "description": asked.description,
-        "procedure": asked.procedure,
-        "consent": describe_consents(recorded.surgeons),
-        "episodes": len({one.recording_row for one in chosen}) if asked.whole else len(chosen),
-        "demos_sha256": sha256(canonical([[one.sha256, splits[one.row]] for one in chosen])),
-    }
-    job, new = jobs.ask(session, EXPORT, request, None, actor)
-    if new:
+    request = DatasetRequest(
+        **asked.model_dump(include={*DatasetRequest.model_fields}) | {"arms": arms},
+        consent=describe_consents(recorded.surgeons),
+        episodes=len({one.recording_row for one in chosen}) if asked.whole else len(chosen),
+        demos_sha256=sha256(canonical([[one.sha256, splits[one.row]] for one in chosen])),
+    )
+    requested = jobs.ask(session, request, None, actor)
+    if requested.new:
         exported = [
-            {"job_row": job.row, "demonstration_row": one.row, "split": splits[one.row], "whole": asked.whole}
+            {"job_row": requested.job.row, "demonstration_row": one.row, "split": splits[one.row], "whole": asked.whole}
             for one in chosen
         ]
         session.execute(insert(DatasetDemonstration), exported)
-    return job, new
+    return requested
 
 
 def _chosen(session: Session, asked: DatasetIn) -> list[_Chosen]:
@@ -256,7 +268,7 @@ class _Episode:
     interval_s: tuple[float, float] | None
 
 
-def export_dataset(database: Database, request: DatasetRequest, settings: Settings) -> Store:
+def export_dataset(database: Database, request: DatasetRequest, settings: Settings) -> Store[DatasetResult]:
     """Write the zip of a dataset to a temporary file; the returned function stores it.
 
     Raises:
@@ -265,24 +277,24 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         BadRecording: A recording cannot be written as an episode; the message names its demonstration.
     """
     with database.reading() as session:
-        job = jobs.find_live(session, EXPORT, request)
+        job = jobs.find_live(session, request)
         if job is None:
             raise Conflict("The export was cancelled.")
         require_exportable(session, job)
         row, export, episodes = job.row, job.id, _episodes(session, job.row)
-    unit = "whole recording" if request["whole"] else "needle hand-off, cut out of a recording"
+    unit = "whole recording" if request.whole else "needle hand-off, cut out of a recording"
     about = AboutDataset(
-        name=request["name"],
-        arms=tuple(request["arms"]),
-        fps=request["fps"],
-        licence=request["licence"],
-        consent=request["consent"],
-        description=f"{request['description']} Each episode is one {unit}.",
-        procedure=request["procedure"],
-        split_by=request["split"],
+        name=request.name,
+        arms=tuple(request.arms),
+        fps=request.fps,
+        licence=request.licence,
+        consent=request.consent,
+        description=f"{request.description} Each episode is one {unit}.",
+        procedure=request.procedure,
+        split_by=request.split,
         export=export,
     )
-    tell = jobs.progress_callback(database, EXPORT, request)
+    tell = jobs.progress_callback(database, request)
     with ExitStack() as opened:
         file = opened.enter_context(TemporaryFile())
         read = confined_reader(settings)
@@ -291,13 +303,13 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
             rule = action_rule(_exported(database, read.parse, episodes, lambda _: tell(0.0)), about)
             about = replace(about, action=rule)
             exported = _exported(database, read.parse, episodes, tell)
-            frames = write_dataset(file, exported, about, cast(Version, request["version"]), settings)
+            frames = write_dataset(file, exported, about, request.version, settings)
         size_bytes = file.tell()
         file.seek(0)
         made = file_digest(file, "sha256").hexdigest()
         until_stored = opened.pop_all()
 
-    def store(session: Session, actor: str) -> dict[str, Any]:
+    def store(session: Session, actor: str) -> DatasetResult:
         job = session.get_one(Job, row)
         surgeons = require_exportable(session, job)
         dataset = StoredDataset(sha256=made, job_row=row, size_bytes=size_bytes)
@@ -307,7 +319,7 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         for number, data in enumerate(iter(partial(file.read, CHUNK_BYTES), b"")):
             session.execute(insert(DatasetChunk), {"dataset_row": dataset.row, "number": number, "data": data})
         record_events(session, actor, "export", EXPORT, [(made, surgeon) for surgeon in surgeons])
-        return {"dataset": made, "size_bytes": size_bytes, "episodes": len(episodes), "frames": frames}
+        return DatasetResult(dataset=made, size_bytes=size_bytes, episodes=len(episodes), frames=frames)
 
     weakref.finalize(store, until_stored.close)  # and not at its end: a cancelled export is never stored
     return store

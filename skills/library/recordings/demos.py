@@ -28,7 +28,7 @@ from skills.library.people import consent
 from skills.library.people.recorded import episodes_of, in_recording, recorded_in
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
-from skills.library.policies.releases import withdraw_failed, withdraw_resting_on
+from skills.library.policies.releases import withdraw_resting_on
 from skills.library.recordings.parts import choose_part
 from skills.library.recordings.recordings import (
     Parser,
@@ -308,7 +308,7 @@ def mark_demo(
     if (demonstration.outcome, demonstration.outcome_reason) != (outcome, reason):
         _mark(session, demonstration, outcome, reason, actor)
     if demonstration.failed:
-        withdraw_failed(session, demonstration, actor)
+        withdraw_resting_on(session, demonstration, actor, marked=True)
     return demonstration
 
 

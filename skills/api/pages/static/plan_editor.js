@@ -244,7 +244,7 @@ get("reach").addEventListener("click", async ({ target }) => {
     });
     [places, step_mm] = [found.places, found.step_mm];
     get("reach-key").hidden = false;
-    get("reach-said").textContent = found.in_words;
+    get("reach-said").textContent = found.description;
     get("reach-said").className = "small";
     draw();
   } catch (problem) {
