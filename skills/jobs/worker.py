@@ -62,9 +62,9 @@ def logged(perform: Perform) -> Perform:
     def run(database: Database, row: int, attempt: int, settings: Settings) -> None:
         about = select(Job.id, Job.kind, Job.state).where(Job.row == row)
 
-        def look() -> tuple[str, str, str]:
+        def look() -> tuple[str, ...]:
             with database.reading() as session:
-                return session.execute(about).tuples().first() or ("", "", "erased")
+                return tuple(session.execute(about).first() or ("", "", "erased"))
 
         name, kind, _ = look()
         token, began, outcome = job_id.set(name), time.monotonic(), ""

@@ -140,6 +140,12 @@ def work(database: Database, job: Job) -> Job:
         return session.get_one(Job, job.row)
 
 
+def wrong(database: Database, *left_out: str, **how: Any) -> list[tuple[str, str]]:
+    """Inspect everything that is stored, as `skills verify` does, and return the faults, except those of some parts."""
+    parts = {id(part): part for part in list(inspect_installation(database, **how))}.values()
+    return [one for part in parts for one in part.wrong if part.what not in left_out]
+
+
 @contextmanager
 def working(settings: Settings) -> Iterator[None]:
     """Carry out all jobs in a thread, in the place of `skills.serving.working`: no process to start for each command.
@@ -186,9 +192,3 @@ def add_plan(database: Database, surgeon: str = "kestrel", **asked: Any) -> Plan
         PlanIn(surgeon=surgeon, suture=SUTURE, suture_points=[{"position_mm": (5.0, 55.0, -125.0)}], **asked),
         "test",
     )[0]
-
-
-def wrong(database: Database, *left_out: str, **how: Any) -> list[tuple[str, str]]:
-    """Inspect everything that is stored, as `skills verify` does, and return the faults, except those of some parts."""
-    parts = {id(part): part for part in list(inspect_installation(database, **how))}.values()
-    return [one for part in parts for one in part.wrong if part.what not in left_out]

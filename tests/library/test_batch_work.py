@@ -18,13 +18,10 @@ from skills.library.policies.requests import TrainingRequest
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
-from tests.library import cases
+from tests.library import cases, styles
 from tests.library.styles import (
-    NO_CONSENT,
     add_styles,
     ask_retraining,
-    count_versions,
-    damage,
     finish,
     look,
     parts_of,
@@ -67,30 +64,30 @@ def before_learning(monkeypatch: pytest.MonkeyPatch) -> Before:
 
 
 def test_one_bad_style_of_eight_fails_with_its_reason_and_seven_are_done(database: Database):
-    add_styles(database, 8)
-    job = ask_retraining(database)
-    damage(database, styles_of(database, job)[3].demonstration_row)
-    for part in parts_of(database, job):
+    styles.add_styles(database, 8)
+    job = styles.ask_retraining(database)
+    styles.damage(database, styles.styles_of(database, job)[3].demonstration_row)
+    for part in styles.parts_of(database, job):
         assert cases.work(database, part).state == "succeeded"
-    assert states_of(database, job) == ["done"] * 3 + ["failed"] + ["done"] * 4
-    bad = styles_of(database, job)[3]
+    assert styles.states_of(database, job) == ["done"] * 3 + ["failed"] + ["done"] * 4
+    bad = styles.styles_of(database, job)[3]
     assert "does not match its checksum" in bad.reason
     assert (bad.policy_row, bad.comparison, bad.ended_at is None) == (None, None, False)
-    batch = look(database, job)
+    batch = styles.look(database, job)
     assert (batch.state, batch.progress) == ("failed", 1.0)
     assert batch.error.startswith("1 of 8 styles failed")
     assert batch.result == {"queued": 0, "done": 7, "failed": 1, "cancelled": 0}
-    assert count_versions(database) == 7
+    assert styles.count_versions(database) == 7
 
 
 def test_styles_without_consent_or_valid_demo_fail_and_the_others_continue(database: Database):
-    add_styles(database, 2)
+    styles.add_styles(database, 2)
     demo = cases.add_demo(database)
     cases.add_surgeon(database, "heron")
     cases.add_demo(database, surgeon="heron")
-    job = ask_retraining(database)
+    job = styles.ask_retraining(database)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", SurgeonIn.model_validate(NO_CONSENT), "test")
+        put_surgeon(session, "kestrel", SurgeonIn.model_validate(styles.NO_CONSENT), "test")
         heron = cases.Demonstration.surgeon.has(slug="heron")
         withdraw_demo(session, session.scalars(select(cases.Demonstration).where(heron)).one().sha256, "test")
     finish(database, job)
@@ -98,7 +95,7 @@ def test_styles_without_consent_or_valid_demo_fail_and_the_others_continue(datab
     assert reasons["surgeon-0"] is None
     assert "does not cover training" in reasons["kestrel"]
     assert "was withdrawn" in reasons["heron"]
-    assert (look(database, job).result["done"], look(database, job).result["failed"]) == (2, 2)
+    assert (styles.look(database, job).result["done"], styles.look(database, job).result["failed"]) == (2, 2)
     assert demo.sha256 not in str(reasons)
 
 
@@ -117,16 +114,16 @@ def test_an_internal_failure_is_retried_and_then_only_its_style_gives_up(
     before_learning(step)
     work = Work(database, Settings(database_url=database.url), perform_job)
     assert not work.try_once(part.row, 1, 0)
-    assert states_of(database, job) == ["done", "queued", "done", "done", "done"]
-    assert look(database, job).state == "running"
-    assert 0.79 < look(database, job).progress < 0.81
+    assert styles.states_of(database, job) == ["done", "queued", "done", "done", "done"]
+    assert styles.look(database, job).state == "running"
+    assert 0.79 < styles.look(database, job).progress < 0.81
     assert not work.try_once(part.row, 1, 1)
     assert learnt.count(bad) == 3  # once among the others, and then alone
     work.give_up(part.row, 1)
-    style = styles_of(database, job)[1]
+    style = styles.styles_of(database, job)[1]
     assert style.state == "failed"
     assert "failed inside the service" in style.reason and "secret" not in style.reason
-    batch = look(database, job)
+    batch = styles.look(database, job)
     assert (batch.state, batch.result["done"], batch.result["failed"]) == ("failed", 4, 1)
 
 
@@ -147,11 +144,11 @@ def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database, in_
         assert start(database, part.row, 1)
         with pytest.raises(Death):
             perform_job(database, part.row, 1, Settings(database_url=database.url))
-        assert states_of(database, job).count("done") == done
-    assert [style.tries for style in styles_of(database, job)] == [2, 3, 2, 2]
+        assert styles.states_of(database, job).count("done") == done
+    assert [style.tries for style in styles.styles_of(database, job)] == [2, 3, 2, 2]
     assert fail(database, part.row, 1, "The worker died at each attempt at this job.")
-    assert states_of(database, job) == ["done", "failed", "done", "done"]
-    assert look(database, job).state == "failed"
+    assert styles.states_of(database, job) == ["done", "failed", "done", "done"]
+    assert styles.look(database, job).state == "failed"
 
 
 def test_a_style_refused_at_commit_does_not_roll_back_the_others(database: Database, in_one_part, before_learning):
@@ -164,9 +161,9 @@ def test_a_style_refused_at_commit_does_not_roll_back_the_others(database: Datab
 
     before_learning(step)
     cases.work(database, part)
-    assert states_of(database, job) == ["done", "failed", "done"]
-    assert "withdrawn while the training used it" in styles_of(database, job)[1].reason
-    assert count_versions(database) == 2
+    assert styles.states_of(database, job) == ["done", "failed", "done"]
+    assert "withdrawn while the training used it" in styles.styles_of(database, job)[1].reason
+    assert styles.count_versions(database) == 2
 
 
 def test_what_takes_long_is_committed_alone(database, in_one_part, before_learning, monkeypatch):
@@ -187,9 +184,9 @@ def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
     database: Database, before_learning, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 2)
-    add_styles(database, 6)
-    job = ask_retraining(database)
-    parts = {style.demonstration_row: style.part_row for style in styles_of(database, job)}
+    styles.add_styles(database, 6)
+    job = styles.ask_retraining(database)
+    parts = {style.demonstration_row: style.part_row for style in styles.styles_of(database, job)}
     learnt = []
 
     def step(lesson: Lesson) -> None:
@@ -202,7 +199,7 @@ def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
         thread.start()
     for thread in both:
         thread.join()
-    assert states_of(database, job) == ["done"] * 6
+    assert styles.states_of(database, job) == ["done"] * 6
     assert learnt in (sorted(learnt), sorted(learnt, reverse=True))
 
 
@@ -225,9 +222,9 @@ def test_a_late_result_changes_nothing_and_its_worker_does_what_is_left(
 
     before_learning(step)
     cases.work(database, part)
-    assert states_of(database, job) == ["done"] * 3
-    assert (count_versions(database), look(database, job).state) == (3, "succeeded")
-    assert [look(database, job).ended_at] == ended
+    assert styles.states_of(database, job) == ["done"] * 3
+    assert (styles.count_versions(database), styles.look(database, job).state) == (3, "succeeded")
+    assert [styles.look(database, job).ended_at] == ended
     with database.reading() as session:
         finished = select(func.count()).where(Event.action == "finish", Event.object_id == job.id)
         assert session.scalar(finished) == 1
