@@ -78,12 +78,6 @@ def upload(data: bytes, media_type: str = "text/csv", **how: Any) -> Upload:
     return Upload(io.BytesIO(data), sha256(data), len(data), media_type, **how)
 
 
-def commit(database: Database, function: Callable[..., T], *given: Any, **how: Any) -> T:
-    """Call a function of the library in a writing transaction, and return its result."""
-    with database.writing() as session:
-        return function(session, *given, **how)
-
-
 def fetch(database: Database, function: Callable[..., T], *given: Any, **how: Any) -> T:
     """Call a function of the library in a reading transaction, and return its result."""
     with database.reading() as session:
@@ -96,10 +90,10 @@ def add_surgeon(database: Database, slug: str = "kestrel", **about: Any) -> None
         put_surgeon(session, slug, SurgeonIn.model_validate(about), "test")
 
 
-def committed(database: Database, change: Callable[..., T], *asked: Any) -> T:
+def committed(database: Database, change: Callable[..., T], *asked: Any, **how: Any) -> T:
     """Call a use case in a transaction of its own."""
     with database.writing() as session:
-        return change(session, *asked)
+        return change(session, *asked, **how)
 
 
 def agree(session: Session, consent: Any, surgeon: str = "kestrel") -> None:

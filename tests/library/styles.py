@@ -22,14 +22,13 @@ from skills.schemas.demos import DemoIn
 from skills.schemas.people import SurgeonIn
 from skills.schemas.training import RetrainingIn
 from tests.library import cases
-from tests.library.cases import commit
 
 NO_CONSENT = {"consent": {"uses": ["atlas"], "until": None}}
 
 
 def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
     """Add a number of styles, twelve per surgeon; return their surgeons and suture types."""
-    commit(database, seed_suture_types)
+    cases.committed(database, seed_suture_types)
     with database.reading() as session:
         sutures = session.scalars(select(SutureType.slug).order_by(SutureType.slug)).all()
     pairs = ((f"surgeon-{n}", suture) for n in count() for suture in sutures)
@@ -47,7 +46,7 @@ def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
 def made_once(database: Database) -> tuple[Made, str]:
     upload = cases.upload(cases.hand_off())
     told = parse_recording(upload.file)
-    commit(database, put_recording, upload, told, entry_of(upload, told), "test")
+    cases.committed(database, put_recording, upload, told, entry_of(upload, told), "test")
     return make_demo(told, DemoIn(surgeon="anybody", suture=cases.SUTURE)), upload.sha256
 
 

@@ -26,7 +26,6 @@ from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
-from tests.library.cases import commit
 
 SUTURE = cases.SUTURE
 AROUND_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10.2, 55, -135]], dtype=float)
@@ -230,17 +229,17 @@ def test_consent_is_asked_and_who_is_left_out_is_counted_and_not_named(database:
 
 def test_who_comes_back_costs_only_the_pairs_that_are_missing(database: Database, measured: list[int]):
     names = small(database)
-    commit(database, cases.agree, {"uses": [], "until": None}, cohorts.name(0))
+    cases.committed(database, cases.agree, {"uses": [], "until": None}, cohorts.name(0))
     atlas_of(database, SUTURE)
     assert measured == [1, 1]
-    commit(database, cases.agree, None, cohorts.name(0))
+    cases.committed(database, cases.agree, None, cohorts.name(0))
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names
     assert measured == [1, 1, 5, 5]
 
 
 def test_withdrawn_ones_are_not_in_it(database: Database):
     names = small(database)
-    commit(database, withdraw_demo, names[0], "test")
+    cases.committed(database, withdraw_demo, names[0], "test")
     found = atlas_of(database, SUTURE)
     assert [one.id for one in found.demos] == names[1:]
     assert (found.recognition, found.votes, found.recognised) == ([], None, None)
@@ -291,7 +290,7 @@ def test_overlapping_cuts_of_one_recording_count_once(database: Database):
         assert "Left out: 2 demonstrations. A newer cut of the same motion counts" in found.left_out.because[0]
     with pytest.raises(Conflict, match="A newer cut of the same motion counts"):
         atlas_of(database, SUTURE, demo=first)
-    commit(database, withdraw_demo, newest, "test")
+    cases.committed(database, withdraw_demo, newest, "test")
     assert [one.id for one in atlas_of(database, SUTURE).demos] == [second, after]
 
 

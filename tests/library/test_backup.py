@@ -26,7 +26,7 @@ from tests import backends
 from tests.api.service import Service
 from tests.jobs.house import House
 from tests.library import cases
-from tests.library.cases import commit, wrong
+from tests.library.cases import wrong
 
 
 def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
@@ -234,14 +234,14 @@ def test_a_demo_erased_and_added_again_before_the_backup_is_not_erased(
     database: Database, empty: Callable[[str], Database], tmp_path: Path
 ):
     demo = cases.add_demo(database).sha256
-    commit(database, erase_demo, demo, "test")
+    cases.committed(database, erase_demo, demo, "test")
     assert cases.add_demo(database).sha256 == demo
     back_up(database, tmp_path / "b.zip")
     keep_erasures(database, tmp_path / "list.json")
     listed = read_erasures(str(tmp_path / "list.json"))
     restored = empty(backends.OTHER[database.engine.dialect.name])
     assert restore(restored, tmp_path / "b.zip", listed).demos_erased == 0
-    commit(database, erase_demo, demo, "test")
+    cases.committed(database, erase_demo, demo, "test")
     keep_erasures(database, tmp_path / "list.json")
     again = empty("sqlite")
     assert restore(again, tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json"))).demos_erased == 1
@@ -252,7 +252,7 @@ def test_a_list_of_erasures_never_shrinks_and_is_refused_if_altered(database: Da
     at = datetime(2026, 1, 1, tzinfo=UTC)
     earlier = Erasures({"11" * 32: ("00", at)}, {"demonstrations": {"ab" * 32: at}})
     assert keep_erasures(database, kept).surgeons == {}
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     now_listed = keep_erasures(database, kept)
     other = Database(backends.fresh("sqlite", tmp_path))
     assert keep_erasures(other, kept) == now_listed == read_erasures(str(kept))

@@ -19,8 +19,8 @@ from skills.scoring.calibration import as_numbers, held_out, rank_correlations
 from skills.scoring.validation import refusals, shuffled
 from tests.formats.trials import kinematics
 from tests.formats.trials import text as as_text
-from tests.library import rated
-from tests.library.cases import commit, fetch, wrong
+from tests.library import cases, rated
+from tests.library.cases import fetch, wrong
 
 META = "meta_file_Suturing.txt"
 
@@ -104,7 +104,7 @@ def test_the_newest_is_used_and_an_equal_one_is_not_kept_again(database: Databas
 
 
 def test_a_calibration_cannot_be_changed_and_damage_is_found(database: Database, about: Calibration) -> None:
-    commit(database, calibrations.put_calibration, about, "test")
+    cases.committed(database, calibrations.put_calibration, about, "test")
     assert not wrong(database)
     with pytest.raises(DatabaseError, match="append-only"), database.writing() as session:
         session.execute(text("UPDATE calibrations SET sha256 = '0'"))

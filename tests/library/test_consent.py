@@ -23,7 +23,7 @@ from skills.library.policies import batches, learning, releases, retraining, ver
 from skills.schemas.people import Consent, SurgeonIn
 from skills.schemas.scores import ScoreIn
 from tests.library import cases
-from tests.library.cases import SUTURE, commit
+from tests.library.cases import SUTURE
 from tests.library.styles import add_styles, ask_retraining, count_versions, counted, parts_of, states_of, styles_of
 
 ALL = {"uses": ["training", "export", "atlas"], "until": None}
@@ -40,7 +40,7 @@ def on_one_day(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def agree(database: Database, to: dict[str, Any] | None, surgeon: str = "kestrel") -> None:
     """Record a surgeon's consent."""
-    commit(database, put_surgeon, surgeon, SurgeonIn.model_validate({"consent": to}), "anna")
+    cases.committed(database, put_surgeon, surgeon, SurgeonIn.model_validate({"consent": to}), "anna")
 
 
 def served(database: Database) -> int | None:
@@ -275,7 +275,7 @@ def test_other_changes_of_a_surgeon_withdraw_nothing(database: Database):
 def test_withdrawn_consent_withdraws_a_surgeons_combined_and_other_styles(database: Database):
     demos = [cases.add_demo(database, cases.hand_off((0.0, 0.0, 1.0 * n))).sha256 for n in range(3)]
     cases.train(database, demos=demos, release=True)
-    commit(database, put_surgeon, "heron", SurgeonIn(), "test")
+    cases.committed(database, put_surgeon, "heron", SurgeonIn(), "test")
     other = cases.add_demo(database, surgeon="heron")
     cases.train(database, "heron", demos=[other.sha256], release=True)
     agree(database, NO_TRAINING)
@@ -327,7 +327,7 @@ def test_a_day_ends_in_utc(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_surgeon_of_whom_nothing_was_ever_recorded_covers_everything(database: Database):
-    commit(database, put_surgeon, "plain", SurgeonIn(), "test")
+    cases.committed(database, put_surgeon, "plain", SurgeonIn(), "test")
     with database.reading() as session:
         plain = find_surgeon(session, "plain")
         assert may(plain, "training")

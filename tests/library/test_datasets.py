@@ -31,7 +31,7 @@ from skills.library.recordings.recordings import store_recording
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests.library import cases, exports
-from tests.library.cases import commit, wrong
+from tests.library.cases import wrong
 from tests.library.exports import PASS_S, add, ask, export, kept, members, read_episode, session_of, zip_of
 from tests.library.test_consent import ALL, agree
 
@@ -242,7 +242,7 @@ def test_an_equal_request_is_the_same_job_and_another_is_another(database: Datab
     job = ask(database)
     assert ask(database).row == job.row == ask(database, demos=[demo[:16]]).row
     assert ask(database, fps=25).row != job.row
-    commit(database, mark_demo, demo, "failure", "it fell", "test")
+    cases.committed(database, mark_demo, demo, "failure", "it fell", "test")
     assert ask(database, outcomes="any").row != job.row  # its split is another one
 
 
@@ -281,7 +281,7 @@ def test_a_cancelled_export_stores_nothing(database: Database, monkeypatch: pyte
 
 
 def cancelled(database: Database, job: Job) -> None:
-    commit(database, cancel, job.id, "test")
+    cases.committed(database, cancel, job.id, "test")
 
 
 def midway(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], None]) -> None:
@@ -315,7 +315,7 @@ def test_the_events_name_everybody_whose_data_is_exported(database: Database):
 def test_a_deleted_dataset_can_be_requested_again(database: Database):
     add(database, session_of())
     dataset = export(database)
-    commit(database, delete_dataset, dataset, "test")
+    cases.committed(database, delete_dataset, dataset, "test")
     assert kept(database) == NONE_LEFT
     export(database)
 
@@ -375,7 +375,7 @@ def test_consent_withdrawn_or_expired_refuses_a_download(database: Database, mon
 def test_a_withdrawn_demonstration_refuses_a_download(database: Database):
     demo = add(database, session_of())
     dataset = export(database)
-    commit(database, withdraw_demo, demo, "test")
+    cases.committed(database, withdraw_demo, demo, "test")
     with pytest.raises(Conflict, match="was withdrawn; export the others again"):
         zip_of(database, dataset)
     with pytest.raises(Conflict, match=f"demonstration {demo[:12]} was withdrawn"):
@@ -432,7 +432,7 @@ def test_erasing_a_demonstration_deletes_the_datasets_with_it(database: Database
     first, _ = add(database, session_of()), add(database, session_of(SHIFT))
     export(database)
     export(database, demos=[first])
-    commit(database, erase_demo, first, "test")
+    cases.committed(database, erase_demo, first, "test")
     assert kept(database) == NONE_LEFT
     export(database)
 
@@ -444,7 +444,7 @@ def test_erasing_a_demonstration_deletes_the_datasets_with_it(database: Database
 def test_erasing_a_surgeon_deletes_the_datasets_with_them(database: Database, apart: bool, whole: bool, gone: bool):
     two_surgeons(database, apart=apart)
     export(database, surgeons=["kestrel"], whole=whole)
-    commit(database, erase_surgeon, "wren", "test")
+    cases.committed(database, erase_surgeon, "wren", "test")
     assert kept(database) == (NONE_LEFT if gone else (1, 1, 1))
     assert not wrong(database)
 
@@ -467,7 +467,7 @@ def test_erasing_a_surgeon_whom_an_upload_named_deletes_it(database: Database, w
 def test_erasing_drops_an_export_that_is_queued_or_runs(database: Database):
     demo = add(database, session_of())
     job = ask(database)
-    assert commit(database, erase_demo, demo, "test") == [(job.row, job.attempt)]
+    assert cases.committed(database, erase_demo, demo, "test") == [(job.row, job.attempt)]
     assert kept(database) == NONE_LEFT
 
 
@@ -476,7 +476,7 @@ def test_erasing_during_the_job_stores_nothing(database: Database, monkeypatch: 
     job = ask(database)
 
     def erased() -> None:
-        commit(database, erase_surgeon, "kestrel", "test")
+        cases.committed(database, erase_surgeon, "kestrel", "test")
 
     midway(monkeypatch, erased)
     with pytest.raises(Conflict, match="cancelled while it ran"):
@@ -500,5 +500,5 @@ def test_a_dataset_is_hidden_with_any_of_its_surgeons(database: Database):
     everybody = database.seen_by(Only("ada", frozenset(rows.values())))
     assert zip_of(everybody, of_both)
     ask(seeing["wren"])  # all that wren may see
-    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate({"consent": NO_EXPORT}), "anna")
+    cases.committed(database, put_surgeon, "kestrel", SurgeonIn.model_validate({"consent": NO_EXPORT}), "anna")
     assert ask(seeing["wren"]).request["episodes"] == 1

@@ -32,7 +32,6 @@ from tests import backends
 from tests.comparison.cohort import cohort
 from tests.db.test_query_plans import noted, plan_of
 from tests.library import cases, cohorts
-from tests.library.cases import commit
 from tests.library.styles import ask_retraining, parts_of
 
 
@@ -86,10 +85,10 @@ def test_an_erasure_deletes_no_shape_of_another_that_has_no_distances(database: 
             return {*session.scalars(select(MeasuredShape.demonstration_row))}
 
     assert cached() == {row for row, _ in demos.values()}
-    commit(database, erase_surgeon, cohorts.name(0), "test")
+    cases.committed(database, erase_surgeon, cohorts.name(0), "test")
     assert cached() == {demos[cohorts.name(k)][0] for k in (1, 2)}
     atlas_of(database, cases.SUTURE)  # now one of them has a distance from the other
-    commit(database, erase_surgeon, cohorts.name(1), "test")
+    cases.committed(database, erase_surgeon, cohorts.name(1), "test")
     assert cached() <= {demos[cohorts.name(2)][0]}
     with database.reading() as session:
         assert all(len(one.measured.others) == 0 for one in session.scalars(select(MeasuredShape)))
@@ -118,7 +117,7 @@ def test_a_recording_is_deleted_by_whoever_sent_it_or_by_an_admin(database: Data
         with pytest.raises(NotFound):
             delete_recording(session, mine, "anna", as_admin=False)
     assert recordings(database) == [others]
-    commit(database, delete_recording, others, "local", as_admin=True)
+    cases.committed(database, delete_recording, others, "local", as_admin=True)
     assert recordings(database) == []
     assert set(erasures_of(database).ended["recordings"]) == {mine, others}
 
@@ -126,11 +125,11 @@ def test_a_recording_is_deleted_by_whoever_sent_it_or_by_an_admin(database: Data
 def test_a_recording_that_somebody_else_sent_as_well_stays_theirs(database: Database):
     sent = stored(database, actor="anna")
     assert stored(database, actor="bert") == sent
-    commit(database, delete_recording, sent, "anna", as_admin=False)
+    cases.committed(database, delete_recording, sent, "anna", as_admin=False)
     assert recordings(database) == [sent]
     with database.writing() as session, pytest.raises(NotAllowed):
         delete_recording(session, sent, "anna", as_admin=False)
-    commit(database, delete_recording, sent, "bert", as_admin=False)
+    cases.committed(database, delete_recording, sent, "bert", as_admin=False)
     assert recordings(database) == []
 
 
@@ -144,7 +143,7 @@ def test_a_recording_with_demos_is_kept_until_its_last_demo_is_erased(database: 
             delete_recording(session, sent, "anna", as_admin=True)
         erase_demo(session, demos[0], "test")
     assert recordings(database) == [sent]
-    commit(database, erase_demo, demos[1], "test")
+    cases.committed(database, erase_demo, demos[1], "test")
     assert recordings(database) == []
 
 
@@ -156,9 +155,9 @@ def test_erasing_a_surgeon_removes_recordings_uploaded_for_them_alone(database: 
     cut = stored(database, 5.0, surgeon="kestrel")
     add_demo(database, cut, DemoIn(surgeon="plover", suture=cases.SUTURE), "anna")
     nobodys = stored(database, 7.5)
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     assert recordings(database) == [both, cut, nobodys]
-    commit(database, erase_surgeon, "plover", "test")
+    cases.committed(database, erase_surgeon, "plover", "test")
     assert recordings(database) == [nobodys]
     with pytest.raises(NotFound, match="nobody"):
         stored(database, 9.0, surgeon="nobody")
@@ -168,14 +167,14 @@ def test_erasing_anothers_demo_keeps_the_recording_of_its_stated_owner(database:
     cases.add_surgeon(database, "plover")
     sent = stored(database, surgeon="plover")
     demo = add_demo(database, sent, DemoIn(surgeon="kestrel", suture=cases.SUTURE), "anna")[0].sha256
-    commit(database, erase_demo, demo, "test")
+    cases.committed(database, erase_demo, demo, "test")
     assert recordings(database) == [sent]
 
 
 def test_a_deleted_recording_does_not_come_back_with_a_backup(database: Database, tmp_path):
     gone, kept = stored(database), stored(database, 2.5)
     back_up(database, tmp_path / "b.zip")
-    commit(database, delete_recording, gone, "anna", as_admin=False)
+    cases.committed(database, delete_recording, gone, "anna", as_admin=False)
     restored = Database(backends.blank("sqlite", tmp_path))
     assert restore(restored, tmp_path / "b.zip", erasures_of(database)).recordings_deleted == 1
     assert recordings(restored) == [kept]
@@ -194,7 +193,7 @@ def test_the_number_of_an_erased_version_is_never_used_again(database: Database)
     first, second = (cases.add_demo(database, cases.hand_off((x, 0.0, 0.0))).sha256 for x in (0.0, 2.5))
     assert numbered(database, first)[0] == 1
     _, before = numbered(database, second)
-    commit(database, erase_demo, second, "test")
+    cases.committed(database, erase_demo, second, "test")
     assert numbered(database, first, seed=1)[0] == 3
     third = cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0))).sha256
     number, after = numbered(database, third)
@@ -209,7 +208,7 @@ def test_a_batch_uses_no_number_again_either(database: Database):
     demo = cases.add_demo(database).sha256
     other = cases.add_demo(database, cases.hand_off((2.5, 0.0, 0.0))).sha256
     assert numbered(database, other)[0] == 1
-    commit(database, erase_demo, other, "test")
+    cases.committed(database, erase_demo, other, "test")
     (part,) = parts_of(database, ask_retraining(database))
     cases.work(database, part)
     with database.reading() as session:
@@ -225,7 +224,7 @@ def test_a_restored_backup_uses_no_number_again(database: Database, tmp_path: Pa
     known = keep_up_erasures(database, tmp_path / "erasures.json")
     assert numbered(database, second)[0] == 2
     if erased:
-        commit(database, erase_demo, second, "test")
+        cases.committed(database, erase_demo, second, "test")
     keep_up_erasures(database, tmp_path / "erasures.json", known)
     with closing(Database(backends.blank("sqlite", tmp_path))) as restored:
         restore(restored, tmp_path / "b.zip", read_erasures(str(tmp_path / "erasures.json")))
@@ -287,7 +286,7 @@ def test_steps_take_fewer_jobs_while_they_take_longer_than_others_may_wait(datab
     """A step seems to take 0.1 s, the next one 0.2 s, and then none any time."""
     cases.add_surgeon(database)
     many_jobs(database, 1000)
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     clock = iter([0.0, 0.1, 0.1, 0.3, *[0.3] * 20])
     monkeypatch.setattr(sweep, "monotonic", lambda: next(clock))
     steps = []

@@ -43,7 +43,7 @@ from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed, check_inclusion
 from tests.library import cases
 from tests.library.attacks import cover_up, found, random_edit, sign_again, tampering
-from tests.library.cases import commit, fetch
+from tests.library.cases import fetch
 
 SURGEONS = logged()["surgeons"].raw
 
@@ -423,7 +423,7 @@ def test_a_row_that_was_erased_and_is_put_back_with_its_old_leaf_is_found(databa
     with database.reading() as session:
         row = session.execute(select(SURGEONS).where(SURGEONS.c.row == 2)).one()._mapping
         old = session.execute(leaf).one()._mapping
-    commit(database, erase_surgeon, "heron", "test")
+    cases.committed(database, erase_surgeon, "heron", "test")
     sign_history(database)
     with tampering(database) as connection:
         connection.execute(SURGEONS.insert(), [dict(row)])
@@ -462,7 +462,7 @@ def test_a_cache_may_be_emptied_by_hand_and_is_logged_again(database: Database):
         with database.reading() as session:
             leaves = session.scalars(select(LEAVES.c.row).where(LEAVES.c.table_name == "parsed_recordings")).all()
         assert len(leaves) == turn + 2
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     assert wrong_in(database) == []
 
 
@@ -481,7 +481,7 @@ def test_uploads_erasures_and_retentions_in_steps_keep_the_history_whole(
     cases.add_demo(database, cases.hand_off((1.0, 0.0, 0.0)), "heron")
     cases.train(database, "heron")
     assert wrong_in(database) == []
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     assert wrong_in(database) == []  # what is left to the sweep is logged still
     sweep.sweep_erased(database)
     assert wrong_in(database) == []
@@ -536,7 +536,7 @@ def test_proofs_are_checked_offline_and_stay_valid_after_an_erasure(database: Da
         node = node_from(stored_tiles(connection))
         proofs = {number: inclusion_proof(len(leaves), number, node) for number, _ in leaves}
         verifier = database.history.key.verifier(note.partition("\n")[0])
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     sign_history(database)
     with database.reading() as session:
         after = dict(session.execute(select(LEAVES.c.number, LEAVES.c.entry)).all())

@@ -15,7 +15,7 @@ from skills.library.people import keys
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.sign_ins import SignInLifetime, csrf_of, note_use, sign_in, sign_out, signed_in
 from tests.library import cases
-from tests.library.cases import commit, fetch
+from tests.library.cases import fetch
 
 LASTS = SignInLifetime(idle_s=3600, most_s=12 * 3600)
 
@@ -125,7 +125,7 @@ def test_a_restricted_key_stays_restricted_when_its_surgeons_are_erased(database
         assert holder is not None
         assert holder.surgeons == {"heron", "kestrel"}
     for slug, left in (("heron", {"kestrel"}), ("kestrel", set())):
-        commit(database, erase_surgeon, slug, "local")
+        cases.committed(database, erase_surgeon, slug, "local")
         with database.reading() as session:
             holder = holder_of(session, key)
             assert holder is not None
@@ -157,7 +157,7 @@ def test_a_sign_in_is_known_by_its_cookie_and_over_with_its_key(database: Databa
 
 def test_a_sign_in_is_over_when_it_was_not_used_and_when_it_is_old(database: Database):
     key = make(database).split("_")[1]
-    cookie = commit(database, sign_in, key, LASTS)
+    cookie = cases.committed(database, sign_in, key, LASTS)
 
     def aged(used_s: float, made_s: float) -> tuple[bool, bool]:
         """Return whether a sign-in is valid, and whether its use is to be recorded, for these ages."""
@@ -174,7 +174,7 @@ def test_a_sign_in_is_over_when_it_was_not_used_and_when_it_is_old(database: Dat
     assert aged(5, 12 * 3600 - 10) == (True, False)
     assert aged(5, 12 * 3600 + 1) == (False, False)
     assert aged(3590, 3590) == (True, True)
-    commit(database, note_use, cookie)
+    cases.committed(database, note_use, cookie)
     with database.reading() as session:
         found = sign_in_of(session, cookie)
         assert found is not None

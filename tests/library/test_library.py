@@ -38,7 +38,6 @@ from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
-from tests.library.cases import commit
 
 AT_ONCE = 8
 SHAKE = np.random.default_rng(5).normal(0, 0.4, (150, 3)).clip(-1, 1)  # mm, less than a quarter of a cell
@@ -61,7 +60,7 @@ def counts(database: Database) -> dict[str, int]:
 
 
 def test_the_catalogue_is_seeded_once(database: Database):
-    assert commit(database, seed_suture_types) == 0
+    assert cases.committed(database, seed_suture_types) == 0
     assert counts(database)["suture_types"] == 11
 
 
@@ -137,7 +136,7 @@ def test_a_hysteresis_that_cannot_be_meant_leaves_no_row(database: Database):
 
 def test_the_same_surgeon_eight_times_at_once_is_one_surgeon(database: Database):
     def put(_: int) -> None:
-        commit(database, put_surgeon, "heron", SurgeonIn(), "test")
+        cases.committed(database, put_surgeon, "heron", SurgeonIn(), "test")
 
     at_once(put)
     assert counts(database)["surgeons"] == 2
@@ -184,7 +183,7 @@ def test_a_job_cancelled_while_it_learns_leaves_no_policy(database: Database, mo
     job = cases.ask_training(database, release=True)
 
     def cancel() -> None:
-        commit(database, jobs.cancel, job.id, "test")
+        cases.committed(database, jobs.cancel, job.id, "test")
 
     interrupted(monkeypatch, cancel)
     assert cases.work(database, job).state == "cancelled"
@@ -197,7 +196,7 @@ def test_a_demonstration_withdrawn_while_it_is_learnt_leaves_no_policy(
     demo = cases.add_demo(database)
 
     def withdraw() -> None:
-        commit(database, withdraw_demo, demo.sha256, "test")
+        cases.committed(database, withdraw_demo, demo.sha256, "test")
 
     interrupted(monkeypatch, withdraw)
     job = cases.work(database, cases.ask_training(database, release=True))
@@ -210,7 +209,7 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
     job = cases.ask_training(database)
 
     def erase() -> None:
-        commit(database, erase_surgeon, "kestrel", "test")
+        cases.committed(database, erase_surgeon, "kestrel", "test")
 
     interrupted(monkeypatch, erase)
     with database.writing() as session:

@@ -21,7 +21,6 @@ from skills.library.recordings.demos import withdraw_demo
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
-from tests.library.cases import commit
 
 
 @pytest.fixture(params=backends.BACKENDS)
@@ -64,7 +63,7 @@ def test_a_new_one_is_found_and_a_withdrawn_one_is_not(database: Database, names
     assert {*found(database, names[0])} == {*names[1:]}
     new = cases.add_demo(database, cohorts.hand_off(cohort(2), 0), cohorts.name(0), grid="fit").sha256
     assert {*found(database, names[0])} == {*names[1:], new}
-    commit(database, withdraw_demo, names[1], "test")
+    cases.committed(database, withdraw_demo, names[1], "test")
     assert {*found(database, names[0])} == {*names[2:], new} and held(database) == 6
     with pytest.raises(Conflict, match="withdrawn"):
         nearest_to(database, names[1], 3)
@@ -76,7 +75,7 @@ def test_a_consent_acts_at_once_in_both_directions(database: Database, names: li
     found(database, names[0])
 
     def agree(uses: list[str]) -> None:
-        commit(database, cases.agree, {"uses": uses, "until": None}, cohorts.name(1))
+        cases.committed(database, cases.agree, {"uses": uses, "until": None}, cohorts.name(1))
 
     agree(["training"])
     assert {*found(database, names[0])} == {names[1], *names[4:]} and held(database) == 4
@@ -169,6 +168,6 @@ def test_the_rows_are_listed_again_only_after_a_change(
     assert listed
     listed.clear()
     assert found(database, names[0]) == before and not listed
-    commit(database, withdraw_demo, before[0], "test")
+    cases.committed(database, withdraw_demo, before[0], "test")
     cases.add_demo(database, cohorts.hand_off(cohort(2), 0), cohorts.name(0), grid="fit")  # as many as before
     assert before[0] not in found(database, names[0]) and listed

@@ -36,7 +36,7 @@ from tests.by_day import some
 from tests.formats import bags, lerobots, trials
 from tests.formats.test_confined import same
 from tests.library import cases
-from tests.library.cases import commit, fetch, wrong
+from tests.library.cases import fetch, wrong
 
 TABLE = cases.hand_off()
 CUT = DemoIn(surgeon="kestrel", suture=cases.SUTURE, start_s=0.1, end_s=1.0)
@@ -77,7 +77,7 @@ def counted(database: Database) -> tuple[int, int]:
 
 
 def test_cutting_scoring_and_the_page_do_not_decode_a_stored_recording(database: Database):
-    commit(database, cases.agree, {"uses": ["atlas"], "until": None})
+    cases.committed(database, cases.agree, {"uses": ["atlas"], "until": None})
     sha256 = add(database)
     asked = ScoreIn(surgeon="kestrel", suture=cases.SUTURE, recording=sha256, start_s=0.0, end_s=0.9)
 
@@ -171,7 +171,7 @@ def test_a_changed_entry_is_never_used_and_is_replaced(database: Database, damag
 
 def test_a_damaged_entry_is_logged_and_found_by_verify(database: Database, caplog: pytest.LogCaptureFixture):
     sha256 = add(database)
-    commit(database, damage_chunk)
+    cases.committed(database, damage_chunk)
     ((where, why),) = wrong(database)
     assert where == "parsed_recordings 1" and why.startswith("The entry does not match its digest")
     caplog.clear()
@@ -347,7 +347,7 @@ def test_erasing_a_surgeon_keeps_anothers_episode_of_one_dataset(database: Datab
             add_demo(database, episodes[surgeon], cut, "test", never)
     told = {surgeon: stored_recording(database, sha256, never) for surgeon, sha256 in episodes.items()}
     assert [len(one.recording.motions[0].stamps_ns) for one in told.values()] == list(lerobots.COUNTS[:2])
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     with pytest.raises(NotFound):
         stored_recording(database, episodes["kestrel"])
     assert same(told["heron"], stored_recording(database, episodes["heron"], never))

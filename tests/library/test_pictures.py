@@ -24,7 +24,7 @@ from skills.simulation import film, pictures
 from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
-from tests.library.cases import commit, fetch
+from tests.library.cases import fetch
 from tests.library.verdicts import verdict_on
 from tests.planning.motions import hand_off, ideal_playback
 from tests.planning.test_trajectory import BESIDE
@@ -85,7 +85,7 @@ def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
     assert job.id in refusal(database, playback)
     store = draw_pictures(database, PicturesRequest.model_validate(job.request), Settings(database_url=database.url))
     for _ in range(2):  # the second time by a worker that does not know of the first
-        assert commit(database, store, "test") == {"playback": playback.sha256}
+        assert cases.committed(database, store, "test") == {"playback": playback.sha256}
     assert len(drawn(database)) == 1
     found = fetch(database, find_pictures, playback)
     assert found.animation_mp4[4:8] == b"ftyp"

@@ -21,7 +21,7 @@ from skills.library.recordings.recordings import store_recording
 from skills.seeds.recordings import sample_recordings
 from tests import backends
 from tests.library import cases
-from tests.library.cases import commit, fetch
+from tests.library.cases import fetch
 
 FIVE = next(one for one in sample_recordings() if len(one.segments) == 5)
 MCAP = "application/vnd.mcap"
@@ -55,7 +55,7 @@ def numbered(found: list[Proposal]) -> list[tuple[str, int]]:
 
 
 def mark(database: Database, recording: str, number: int, state: str, note: str | None = None) -> Proposal:
-    return commit(database, decide, recording, number, state, note, "anna")
+    return cases.committed(database, decide, recording, number, state, note, "anna")
 
 
 def cut(database: Database, one: Proposal, surgeon: str = "kestrel", late_s: float = 0.0) -> str:
@@ -94,7 +94,7 @@ def test_a_cut_accepts_its_proposal_and_a_rejection_stays(five: Database):
     with pytest.raises(Conflict, match="was accepted"):
         mark(five, recording, 1, "rejected")
     assert mark(five, recording, 2, "open").state == "open"
-    commit(five, withdraw_demo, demo, "anna")
+    cases.committed(five, withdraw_demo, demo, "anna")
     assert states(five, recording)[0] == "accepted"  # a withdrawn cut cannot be made again
     for number in (0, 6):
         with pytest.raises(NotFound, match="it has 5"):
@@ -111,7 +111,7 @@ def test_decisions_are_deleted_with_their_recording(five: Database):
     (first, *_, other) = listed(five)[2:3] + listed(five)[:1]
     for one in (first, other):
         mark(five, one.recording.sha256, 1, "rejected", "by a name")
-    commit(five, erase_surgeon, "kestrel", "anna")
+    cases.committed(five, erase_surgeon, "kestrel", "anna")
     with five.writing() as session:
         assert session.scalars(select(ProposalMark.recording_row)).all() == [other.recording.row]
         delete_recording(session, other.recording.sha256, "bert", as_admin=False)

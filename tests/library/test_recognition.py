@@ -11,7 +11,6 @@ from skills.library.comparison.recognition import recognise_recording
 from skills.schemas.comparison import RecognisedRecording
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
-from tests.library.cases import commit
 
 
 def recognised(database: Database, recording: str) -> RecognisedRecording:
@@ -29,9 +28,9 @@ def test_only_recordings_of_one_surgeon_who_agreed_are_compared(database: Databa
     with pytest.raises(Conflict, match="Several surgeons"):
         recognised(database, second)
     assert recognised(database, first).votes.recordings == 4  # the other one of its surgeon has no other session
-    commit(database, cases.agree, {"uses": [], "until": None}, cohorts.name(2))
+    cases.committed(database, cases.agree, {"uses": [], "until": None}, cohorts.name(2))
     with pytest.raises(BadInput, match="two surgeons with two sessions"):
         recognised(database, first)
-    commit(database, cases.agree, {"uses": [], "until": None}, cohorts.name(0))
+    cases.committed(database, cases.agree, {"uses": [], "until": None}, cohorts.name(0))
     with pytest.raises(NotFound, match="no demonstration"):
         recognised(database, first)

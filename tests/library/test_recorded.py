@@ -28,7 +28,6 @@ from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
-from tests.library.cases import commit
 from tests.library.exports import PASS_S, add, session_of
 
 SHIFT = (2.5, 0.0, 0.0)
@@ -37,7 +36,7 @@ FIRST, SECOND = {"start_s": 0.0, "end_s": PASS_S - 0.02}, {"start_s": PASS_S, "e
 
 
 def agree(database: Database, surgeon: str, to: Any) -> None:
-    commit(database, put_surgeon, surgeon, SurgeonIn.model_validate({"consent": to}), "anna")
+    cases.committed(database, put_surgeon, surgeon, SurgeonIn.model_validate({"consent": to}), "anna")
 
 
 def doors(database: Database, demo: str) -> dict[str, bool]:
@@ -130,7 +129,7 @@ def test_erasing_a_named_surgeon_opens_nothing(database: Database, to: Any) -> N
     demo = add(database, session_of())
     name_wren(database, demo)
     agree(database, "wren", to)
-    commit(database, erase_surgeon, "wren", "test")
+    cases.committed(database, erase_surgeon, "wren", "test")
     assert shut(database, demo) == OF_ALL | OF_ITS_SECONDS
 
 
@@ -141,7 +140,7 @@ def test_erasing_a_surgeon_leaves_their_seconds_for_no_use(database: Database, a
     demo = add(database, both, **FIRST)
     add(database, both, "wren", **(SECOND | {"start_s": PASS_S / 2} if at_once else SECOND))
     agree(database, "wren", NOTHING)
-    commit(database, erase_surgeon, "wren", "test")
+    cases.committed(database, erase_surgeon, "wren", "test")
     assert shown(database, demo) == ({"path"} if at_once else {"path", "demos"})
     assert shut(database, demo) == OF_ALL | (OF_ITS_SECONDS if at_once else set())
 
@@ -150,19 +149,19 @@ def test_a_surgeon_of_an_erased_demonstration_is_still_asked(database: Database)
     cases.add_surgeon(database, "wren")
     both = session_of((0.0, 0.0, 0.0), SHIFT)
     demo, other = add(database, both, **FIRST), add(database, both, "wren", **SECOND)
-    commit(database, erase_demo, other, "test")
+    cases.committed(database, erase_demo, other, "test")
     assert shut(database, demo) == set()
     agree(database, "wren", NOTHING)
     assert shut(database, demo) == OF_ALL
-    commit(database, erase_surgeon, "wren", "test")
+    cases.committed(database, erase_surgeon, "wren", "test")
     assert shut(database, demo) == OF_ALL
 
 
 def test_a_recording_that_is_deleted_takes_its_intervals_along(database: Database) -> None:
     demo = add(database, session_of())
     name_wren(database, demo)
-    commit(database, erase_surgeon, "wren", "test")
-    commit(database, erase_demo, demo, "test")
+    cases.committed(database, erase_surgeon, "wren", "test")
+    cases.committed(database, erase_demo, demo, "test")
     assert shut(database, add(database, session_of())) == set()
 
 
@@ -171,7 +170,7 @@ def test_a_restored_backup_with_the_list_of_erasures_opens_nothing(database: Dat
     name_wren(database, demo)
     agree(database, "wren", NOTHING)
     back_up(database, tmp_path / "before.zip")
-    commit(database, erase_surgeon, "wren", "test")
+    cases.committed(database, erase_surgeon, "wren", "test")
     back_up(database, tmp_path / "after.zip")
     for name in ("before", "after"):
         restored = Database(backends.blank("sqlite", tmp_path))
@@ -189,7 +188,7 @@ def test_scores_ask_everybody_in_the_recording(database: Database) -> None:
     agree(database, "wren", NOTHING)
     with pytest.raises(Conflict, match="does not cover comparisons"):
         score(database, asked, parse_recording)
-    commit(database, erase_surgeon, "wren", "test")
+    cases.committed(database, erase_surgeon, "wren", "test")
     with pytest.raises(Conflict, match="does not cover comparisons"):
         score(database, asked, parse_recording)
 
@@ -201,7 +200,7 @@ def test_a_recording_of_several_surgeons_is_recognised_as_nobodys(database: Data
     recording = store_recording(database, cases.upload(sent), "test", surgeon="kestrel")[0].sha256
     with pytest.raises(Conflict, match="Several surgeons"):
         recognise_recording(database, recording, cases.SUTURE, parse_recording)
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     with pytest.raises(Conflict, match="Several surgeons"):
         recognise_recording(database, recording, cases.SUTURE, parse_recording)
 
@@ -212,6 +211,6 @@ def test_a_proposal_is_not_the_others_after_one_of_two_was_erased(database: Data
         recording = store_recording(database, cases.upload(cases.hand_off()), "test", surgeon=surgeon)[0].sha256
     with database.reading() as session:
         assert find_proposal(session, recording, 1).surgeon is None
-    commit(database, erase_surgeon, "wren", "test")
+    cases.committed(database, erase_surgeon, "wren", "test")
     with database.reading() as session:
         assert find_proposal(session, recording, 1).surgeon is None

@@ -31,7 +31,6 @@ from skills.serving import keeping_erasures
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
-from tests.library.cases import commit
 
 BOTH = {"uses": ["training", "export"], "until": None}
 
@@ -71,7 +70,7 @@ def whole(database: Database) -> bool:
 
 def test_erasing_what_is_served_never_lets_an_older_release_come_back(database: Database):
     _, second = two_releases(database)
-    commit(database, erase_demo, second, "test")
+    cases.committed(database, erase_demo, second, "test")
     assert served(database) is None
 
 
@@ -131,7 +130,7 @@ def test_what_ended_and_was_allowed_again_before_the_backup_stands(
     assert served(after) == policy.sha256
     with after.reading() as session:
         assert find_surgeon(session, "kestrel").consent == Consent.model_validate(BOTH)
-    commit(database, erase_demo, demo, "test")
+    cases.committed(database, erase_demo, demo, "test")
     again = restored()
     with again.reading() as session:
         assert session.scalars(select(Demonstration)).all() == []
@@ -147,7 +146,7 @@ def test_a_deleted_recording_that_is_used_again_does_not_block_a_restore(
 ):
     back_up(database, tmp_path / "b.zip")
     sent, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
-    commit(database, delete_recording, sent.sha256, "test", as_admin=True)
+    cases.committed(database, delete_recording, sent.sha256, "test", as_admin=True)
     again = restored()  # it knows nothing of the deletion; the list does
     cases.add_surgeon(again)
     demo = cases.add_demo(again).sha256
@@ -166,7 +165,7 @@ def test_a_recording_deleted_after_the_backup_is_deleted_again(
         for shift in (0.0, 1.0)
     )
     back_up(database, tmp_path / "b.zip")
-    commit(database, delete_recording, gone, "test", as_admin=True)
+    cases.committed(database, delete_recording, gone, "test", as_admin=True)
     with restored().reading() as session:
         assert session.scalars(select(StoredRecording.sha256)).all() == [kept]
 
@@ -175,7 +174,7 @@ def test_a_key_that_was_revoked_stays_revoked(database: Database, restored: Call
     with database.writing() as session:
         ids = [create_key(session, owner, "reader", "test")[0].id for owner in ("anna", "bert")]
     back_up(database, tmp_path / "b.zip")
-    commit(database, revoke_key, ids[0], "test")
+    cases.committed(database, revoke_key, ids[0], "test")
     with restored().reading() as session:
         assert {key.id: key.revoked_at is None for key in session.scalars(select(Key))} == {ids[0]: False, ids[1]: True}
 
@@ -194,9 +193,13 @@ def test_a_key_that_was_revoked_stays_revoked(database: Database, restored: Call
 def test_a_consent_that_was_narrowed_stays_narrow_and_none_is_widened(
     before: Any, after: Any, left: Any, database: Database, restored: Callable[[], Database], tmp_path: Path
 ):
-    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate({"consent": before, "protocol": "IRB 1"}), "test")
+    cases.committed(
+        database, put_surgeon, "kestrel", SurgeonIn.model_validate({"consent": before, "protocol": "IRB 1"}), "test"
+    )
     back_up(database, tmp_path / "b.zip")
-    commit(database, put_surgeon, "kestrel", SurgeonIn.model_validate({"consent": after, "protocol": "IRB 1"}), "test")
+    cases.committed(
+        database, put_surgeon, "kestrel", SurgeonIn.model_validate({"consent": after, "protocol": "IRB 1"}), "test"
+    )
     with restored().reading() as session:
         surgeon = find_surgeon(session, "kestrel")
         assert (surgeon.consent, surgeon.protocol) == (Consent.model_validate(left), "IRB 1")
@@ -224,12 +227,12 @@ def test_the_service_keeps_the_list_up_while_it_runs(database: Database, tmp_pat
     file = tmp_path / "kept" / "erasures.json"
     with keeping_erasures(Settings(database_url=database.url, erasures_file=file)):
         assert read_erasures(str(file)).demos == set()
-        commit(database, erase_demo, demo, "test")
+        cases.committed(database, erase_demo, demo, "test")
         deadline_s = time.monotonic() + 60
         while read_erasures(str(file)).demos != {demo}:
             assert time.monotonic() < deadline_s
             time.sleep(0.05)
-        commit(database, erase_surgeon, "kestrel", "test")
+        cases.committed(database, erase_surgeon, "kestrel", "test")
     assert len(read_erasures(str(file)).surgeons) == 1  # written once more at the end
 
 

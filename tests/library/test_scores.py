@@ -21,7 +21,6 @@ from skills.schemas.people import SurgeonIn
 from skills.schemas.scores import Score, ScoreIn
 from skills.scoring.calibration import SkillModel, as_numbers
 from tests.library import cases, rated
-from tests.library.cases import commit
 from tests.scoring.test_rating import JUDGED as RATED
 from tests.scoring.test_rating import model
 
@@ -146,7 +145,7 @@ def test_overlapping_cuts_of_one_motion_count_once(database: Database) -> None:
     novice = next(one for one in told.percentiles if one.level == "novice")
     assert (novice.demos, novice.surgeons) == (LEAST_DEMOS, 1)  # none of the motion's own cuts
     assert [one.demo for one in told.curve] == [mine.sha256]
-    commit(database, withdraw_demo, mine.sha256, "test")
+    cases.committed(database, withdraw_demo, mine.sha256, "test")
     novice = next(one for one in scored(database, another).percentiles if one.level == "novice")
     assert novice.demos == LEAST_DEMOS
 
@@ -159,7 +158,7 @@ def test_a_newer_cut_that_failed_does_not_hide_one_that_did_not(database: Databa
     tip_mm = cases.points_mm(samples=40)
     cases.add_demo(database, cases.table(tip_mm), "wren")
     failed = cases.add_demo(database, cases.table(tip_mm), "wren", start_s=0.1)
-    commit(database, mark_demo, failed.sha256, "failure", "The needle fell.", "test")
+    cases.committed(database, mark_demo, failed.sha256, "failure", "The needle fell.", "test")
     put(database, "plover")
     told = scored(database, bent(20.0, "plover", database))
     (novice,) = (one for one in told.percentiles if one.level == "novice")
@@ -235,7 +234,7 @@ def test_what_cannot_be_scored_is_refused(database: Database) -> None:
         scored(database, interrupted)
     with pytest.raises(BadInput, match="of another style"):
         scored(database, mine, reference=mine.sha256)
-    commit(database, withdraw_demo, reference.sha256, "test")
+    cases.committed(database, withdraw_demo, reference.sha256, "test")
     with pytest.raises(Conflict, match="reference was withdrawn"):
         scored(database, mine, reference=reference.sha256)
     with pytest.raises(Conflict, match="demonstration was withdrawn"):

@@ -26,7 +26,6 @@ from skills.settings import Settings
 from skills.verification.playback import Pictures
 from tests.db.test_query_plans import noted
 from tests.library import cases
-from tests.library.cases import commit
 from tests.library.styles import ask_retraining, counted, finish, look, parts_of
 from tests.library.test_pictures import store_playback
 from tests.planning.motions import ideal_playback
@@ -136,7 +135,7 @@ def test_a_content_half_cached_is_not_used_and_is_completed(
 
 def test_a_deleted_recording_is_gone_at_once_and_swept_later(database: Database, small: None):
     stored, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
-    commit(database, delete_recording, stored.sha256, "test", as_admin=True)
+    cases.committed(database, delete_recording, stored.sha256, "test", as_admin=True)
     with database.reading() as session, pytest.raises(NotFound):
         find_recording(session, stored.sha256)
     assert counted(database, models.RecordingChunk) > 0
@@ -186,7 +185,7 @@ def test_an_erased_surgeons_jobs_are_gone_at_once_and_swept_later(
     cases.add_demo(database)
     cases.train(database, release=True)
     add_jobs(database, 10)
-    commit(database, erase_surgeon, "kestrel", "test")
+    cases.committed(database, erase_surgeon, "kestrel", "test")
     assert (counted(database, Job), counted(database, ErasedSurgeon)) == (11, 1)
     with database.reading() as session:
         assert list(list_jobs(session, 50, None, None)) == []

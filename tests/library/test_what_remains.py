@@ -22,7 +22,6 @@ from skills.library.recordings.recordings import store_recording
 from skills.schemas.training import TrainingIn
 from skills.verification.playback import Pictures
 from tests.library import cases, exports
-from tests.library.cases import commit
 from tests.library.styles import ask_retraining, finish
 from tests.library.test_pictures import store_playback
 from tests.planning.motions import ideal_playback
@@ -66,7 +65,7 @@ def whole(database: Database, surgeon: str, shift: float, seed: int) -> list[str
     demos = [exports.add(database, exports.session_of((shift + more, 0.0, 0.0)), surgeon) for more in (0.0, 0.5)]
     sent = cases.upload(cases.hand_off((shift + 1, 0, 0)))
     uncut, _ = store_recording(database, sent, "test", surgeon=surgeon)
-    commit(database, decide, uncut.sha256, 1, "rejected", "idle", "test")
+    cases.committed(database, decide, uncut.sha256, 1, "rejected", "idle", "test")
     learn(database, surgeon, *demos, seed, release=True)
     job = ask_retraining(database, surgeon=surgeon)
     finish(database, job)
