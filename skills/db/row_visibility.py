@@ -26,13 +26,19 @@ UNRESTRICTED_TABLES = (
 # The tables whose rows are visible together with the row that one of their columns names, by this column.
 VISIBLE_WITH: dict[str, tuple[type[Base], ...]] = {
     "surgeon_row": (
-        *(models.RecordingSurgeon, models.Demonstration, models.PolicyVersion),
-        *(models.LastUsed, models.Release),
+        models.RecordingSurgeon,
+        models.Demonstration,
+        models.PolicyVersion,
+        models.LastUsed,
+        models.Release,
     ),
     "recording_row": (models.ErasedInterval, models.ParsedRecording, models.ParsedChunk, models.ProposalMark),
     "demonstration_row": (
-        *(models.DemonstrationOutcome, models.MeasuredShape, models.StoredRewardMap),
-        *(DatasetDemonstration, StyleToRetrain),
+        models.DemonstrationOutcome,
+        models.MeasuredShape,
+        models.StoredRewardMap,
+        DatasetDemonstration,
+        StyleToRetrain,
     ),
     "policy_row": (models.PolicyDemonstration, models.StoredPoses, models.Plan),
     "plan_row": (models.StoredPlayback,),

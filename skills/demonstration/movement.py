@@ -165,7 +165,14 @@ def spans_of(seconds: Floats, on: Flags) -> list[Span]:
 
 
 def runs(on: Flags) -> list[tuple[int, int]]:
-    """Return the first index and the end, exclusive, of each run in which a condition, (N,), holds."""
+    """Return the runs of samples in which a condition holds.
+
+    Args:
+        on: The condition at each sample, shape (N,).
+
+    Returns:
+        First index and end, exclusive, of each run, in order.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate(([False], on, [False])).astype(np.int8)))
     return [(first, end) for first, end in edges.reshape(-1, 2).tolist()]
 

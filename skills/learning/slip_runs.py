@@ -152,7 +152,14 @@ def walk(controller: Controller, path: GridPath, start: int, slips: Bytes, touch
 
 
 def leads_to(grid: GridWorld) -> Ints:
-    """Return the state after each state and action, (n_states, 27): itself for a move off the grid."""
+    """Return the state to which each action leads from each state.
+
+    Args:
+        grid: The grid world.
+
+    Returns:
+        Shape (n_states, 27); the state itself for a move off the grid.
+    """
     here = np.arange(grid.n_states)
     cells = grid.cells_of(here)[:, None] + MOVES
     on_grid = grid.holds(cells)

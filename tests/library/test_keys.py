@@ -1,6 +1,7 @@
 """Keys and sign-ins, on both back ends."""
 
 from datetime import timedelta
+from typing import Any
 
 import pytest
 from sqlalchemy import select, text, update
@@ -14,6 +15,7 @@ from skills.errors import BadInput, Conflict, NotFound
 from skills.library.people import keys
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.sign_ins import SignInLifetime, csrf_of, note_use, sign_in, sign_out, signed_in
+from skills.settings import Role
 from tests.library import cases
 from tests.library.cases import fetch
 
@@ -28,9 +30,9 @@ def sign_in_of(session: Session, cookie: str) -> tuple[keys.Holder, bool] | None
     return signed_in(session, [cookie], LASTS).get(cookie)
 
 
-def make(database: Database, owner: str = "anna", role: str = "reader", **how: object) -> str:
+def make(database: Database, owner: str = "anna", role: Role = "reader", **how: Any) -> str:
     with database.writing() as session:
-        return keys.create_key(session, owner, role, "local", **how)[1]  # type: ignore[arg-type]
+        return keys.create_key(session, owner, role, "local", **how)[1]
 
 
 def test_a_key_is_known_by_what_is_shown_once_and_nowhere_stored(database: Database):
