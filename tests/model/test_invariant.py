@@ -12,14 +12,14 @@ from hypothesis.stateful import run_state_machine_as_test
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
-from skills import library
 from skills.comparison.distances import Measured
 from skills.db.history import History
 from skills.db.models import Demonstration, ErasedInterval, MeasuredShape, RecordingSurgeon, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database
+from skills.library import perform
 from skills.library.comparison import measuring
-from skills.library.operation import backup, locks
+from skills.library.operation import erasure_list, locks
 from skills.library.people import erasure
 from skills.library.policies import training
 from skills.library.recordings import proposals
@@ -220,7 +220,7 @@ PUT_BACK: dict[str, tuple[object, str, Callable[..., object], str]] = {
         "a_training_is_asked_for_again_after_a_withdrawal",
     ),
     "a_restore_withdraws_nothing_again": (
-        backup,
+        erasure_list,
         "withdraw_policies",
         lambda *_: None,
         "a_release_is_withdrawn_after_the_backup",
@@ -232,7 +232,7 @@ PUT_BACK: dict[str, tuple[object, str, Callable[..., object], str]] = {
         "a_demonstration_is_erased_while_the_atlas_measures",
     ),
     "a_job_goes_on_after_it_was_erased": (
-        library,
+        perform,
         "while_running",
         lambda database, *_: database,
         "a_demonstration_is_erased_between_a_tries_check_and_its_cut",
@@ -251,6 +251,13 @@ PUT_BACK: dict[str, tuple[object, str, Callable[..., object], str]] = {
         "a_rejected_proposal_is_opened_and_accepted_after_the_backup",
     ),
 }
+
+
+@pytest.mark.parametrize("defect", PUT_BACK)
+def test_a_defect_can_be_put_back(defect: str):
+    """By day, because the tests that put it back run at night."""
+    where, name, *_, steps = PUT_BACK[defect]
+    assert hasattr(where, name) and steps in FOUND
 
 
 @pytest.mark.nightly
