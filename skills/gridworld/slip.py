@@ -5,7 +5,7 @@
 With the probability `slip` a move slips: then one of the 27 moves, each as likely, is made instead of the intended one.
 It may be the intended one; off the grid the arm stays. This is the only place that says so: learning, exact values,
 odds and runs take a `SlipModel`, and follow from its numbers. Another model is another function beside `slip_model`,
-and a setting of the learner that selects it.
+and a setting in `skills.learning.learner_state` that selects it.
 """
 
 from dataclasses import dataclass

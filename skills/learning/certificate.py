@@ -20,7 +20,6 @@ from skills.errors import BadSettings
 from skills.fields import Count, schema
 from skills.gridworld.domain import FINISHED
 from skills.gridworld.reward import sparse_reward
-from skills.gridworld.slip import slip_model
 from skills.learning.dynamic_programming import FAINT, Mdp, action_values, exact_q, exact_values, log_losses
 from skills.learning.policy import Policy
 from skills.learning.ties import TIE, off_rule
@@ -308,7 +307,7 @@ def mdp_of(policy: Policy) -> Mdp:
     """
     learner = policy.learner
     reward = sparse_reward(policy.path, policy.levels)
-    return Mdp(policy.domain, reward, learner.gamma, slip_model(learner.slip), policy.hazards)
+    return Mdp(policy.domain, reward, learner.gamma, learner.slip_model, policy.hazards)
 
 
 def _achieved(policy: Policy) -> tuple[Floats, Floats]:
@@ -387,7 +386,7 @@ def least_gamma(policy: Policy) -> float | None:
     Returns:
         The gamma; None if the bound that slips leave says nothing about any below 1.
     """
-    intended = slip_model(policy.learner.slip).intended
+    intended = policy.learner.slip_model.intended
     # A move multiplies a value by gamma times the probability that it does not slip, or more, and the worth of the path
     # is at least `visited`.
     least, longest = FAINT / policy.levels.visited, max(1, int(_fewest_moves(policy).max()))

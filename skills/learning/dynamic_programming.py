@@ -338,7 +338,7 @@ def iterate_values(reward: RewardMap, settings: ValueIteration, hazards: Hazards
         BadSettings: Value iteration does not settle.
     """
     domain = Domain(reward.path, settings.phased, settings.join_share)
-    return exact_q(Mdp(domain, reward, settings.gamma, slip_model(settings.slip), hazards))
+    return exact_q(Mdp(domain, reward, settings.gamma, settings.slip_model, hazards))
 
 
 # ---- compiled loops -------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from skills.errors import BadSettings
 from skills.gridworld.domain import check_join_share
+from skills.gridworld.slip import SlipModel, slip_model
 
 
 class CellState:
@@ -13,6 +14,7 @@ class CellState:
     phased: ClassVar[bool] = False
     slip: ClassVar[float] = 0.0
     join_share: ClassVar[float] = 0.0
+    slip_model: ClassVar[SlipModel] = slip_model(0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,3 +35,8 @@ class PhaseState:
         if not 0 <= self.slip < 1:
             raise BadSettings("slip must lie in [0, 1).", slip=self.slip)
         check_join_share(self.join_share)
+
+    @property
+    def slip_model(self) -> SlipModel:
+        """How moves slip: learning, exact values, certificates and odds follow it."""
+        return slip_model(self.slip)

@@ -32,7 +32,7 @@ from skills.gridworld.domain import Domain
 from skills.gridworld.grid import GridPath
 from skills.gridworld.hazards import Hazards
 from skills.gridworld.reward import RewardMap
-from skills.gridworld.slip import SlipModel, slip_model
+from skills.gridworld.slip import SlipModel
 from skills.learning.learner_state import CellState, PhaseState
 
 Model = NDArray[np.int32]
@@ -197,7 +197,7 @@ def _learn_in_phases(
     """
     sweeper = Sweeper(reward, learner, hazards)
     model = np.full((reward.path.grid.n_states, paper.N_ACTIONS), UNKNOWN, np.int32)
-    slip = slip_model(learner.slip)
+    slip = learner.slip_model
     if learner.slip == 0:
         _explore(model, reward.path, slip, cap, chance, hazards)
         settled = sweeper.settle(model)
