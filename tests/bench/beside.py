@@ -12,9 +12,8 @@ from fastapi import FastAPI, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skills import serving
+from skills.api.app import create_app
 from skills.settings import settings
-
-create_app = serving.create_app
 
 
 def constants(sizes: list[int]) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
@@ -63,5 +62,5 @@ class Beside:
 
 if __name__ == "__main__":
     sizes = [int(one) for one in sys.argv[1:]]
-    serving.create_app = lambda given: Beside(create_app(given), sizes)  # type: ignore[assignment,return-value]
+    vars(serving)["create_app"] = lambda given: Beside(create_app(given), sizes)
     serving.serve(settings())

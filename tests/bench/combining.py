@@ -80,7 +80,7 @@ def _left_out(demos: list[Demo], outlier: bool, rng: np.random.Generator) -> Ite
 def _distances(held: Demo, rest: list[Demo]) -> list[tuple[float, float]]:
     """Measure each method's path, and its grid path, against the left-out demonstration, aligned with it: (M, 2)."""
     (wanted, *_, newest), moved = side_by_side([held, *rest], 0)
-    ways = [newest, *(combine(rest, how()).tip_mm for how in COMBININGS.values())]
+    ways = [newest, *(combine(rest, how).tip_mm for how in COMBININGS)]
     if moved:
         ways = [laid(placed(way, scaled=True), *wanted[[0, -1]]) for way in ways]
     grids = [discretize(way, choose_grid(way, "fit")).tip_mm for way in ways]

@@ -43,11 +43,11 @@ def containing(table: Table) -> None:
     _row(table, "a new interpreter that returns a number", _alone, _alone, ROUNDS)
     with _server(True) as contained, _server(False) as free, tempfile.TemporaryFile() as given:
         calls = (partial(_calls, server, given) for server in (contained, free))
-        _row(table, f"a call in a fork, of {FORKS}", *calls, ROUNDS, FORKS)
+        _row(table, f"a call in a fork, of {FORKS}", *calls, rounds=ROUNDS, each=FORKS)
     with _server(True, READY) as contained, _server(False, READY) as free, tempfile.TemporaryFile() as given:
         given.write(large.four_arms())
         readers = (partial(_reader(server), given) for server in (contained, free))
-        _row(table, "reading four arms, 60 s at 200 Hz, in a fork", *readers, ROUNDS)
+        _row(table, "reading four arms, 60 s at 200 Hz, in a fork", *readers, rounds=ROUNDS)
     _row(table, "playing a short plan", partial(play, TRAJECTORY), partial(play, TRAJECTORY), 3)
 
 

@@ -9,6 +9,7 @@ from rich.table import Table
 
 from skills.arrays import xyz
 from skills.gridworld.scene import Scene, Tissue
+from skills.kinematics import instrument_of
 from skills.library.plans.plans import trajectory_of
 from skills.planning.handoff import HOLDING_RAD, PsmM
 from skills.planning.plan import SuturePoint, stack
@@ -123,41 +124,41 @@ def plain(asked: simulator.PlayRequest, at_once: bool = False) -> None:
         _plain_kinematic(one, arm_rows, m_rows, set(asked.looks.tolist()), at_once)
     with simulator.opened(motion.instrument, motion.rate_hz) as one:
         one.place_pad(motion.tip_mm, asked.pad_top_mm)
-        _plain_servo(one, arm_rows, motion.rate_hz)
+        _plain_servo(one, arm_rows, motion)
 
 
 def _plain_kinematic(
     one: simulator.Simulator, arm_rows: list[list[float]], m_rows: list[list[float]], due: set[int], at_once: bool
 ) -> None:
-    bullet, client, arm, m, pad = one.bullet, one.client, one.arm, one.psm_m, one.pad
+    bullet, arm, m, pad = one.bullet, one.arm, one.psm_m, one.pad
     assert m is not None
     seen_m = CLEARANCE_SEEN_MM * simulator.MM
     reset, together = bullet.resetJointState, bullet.resetJointStatesMultiDof
 
     def put(body: simulator.SceneBody, row: list[float]) -> None:
         if at_once:
-            together(body.number, body.joints, [[value] for value in row], physicsClientId=client)
+            together(body.number, body.joints, [[value] for value in row])
         else:
             for joint, value in zip(body.joints, row, strict=True):
-                reset(body.number, joint, value, physicsClientId=client)
+                reset(body.number, joint, value)
 
     for k, row in enumerate(arm_rows):
         put(arm, row)
-        bullet.getJointStates(arm.number, arm.joints, physicsClientId=client)
-        bullet.getLinkState(arm.number, arm.tool, 0, 1, physicsClientId=client)
+        bullet.getJointStates(arm.number, arm.joints)
+        bullet.getLinkState(arm.number, arm.tool, 0, 1)
         if k in due:
             put(m, m_rows[k])
-            bullet.getLinkState(m.number, m.tool, 0, 1, physicsClientId=client)
-            bullet.getClosestPoints(arm.number, pad, seen_m, physicsClientId=client)
-            bullet.getClosestPoints(arm.number, m.number, seen_m, physicsClientId=client)
-            bullet.getClosestPoints(m.number, pad, seen_m, physicsClientId=client)
-            bullet.getLinkState(arm.number, arm.shaft, 0, 1, physicsClientId=client)
+            bullet.getLinkState(m.number, m.tool, 0, 1)
+            bullet.getClosestPoints(arm.number, pad, seen_m)
+            bullet.getClosestPoints(arm.number, m.number, seen_m)
+            bullet.getClosestPoints(m.number, pad, seen_m)
+            bullet.getLinkState(arm.number, arm.shaft, 0, 1)
 
 
-def _plain_servo(one: simulator.Simulator, rows: list[list[float]], rate_hz: float) -> None:
-    bullet, client, arm, pad = one.bullet, one.client, one.arm, one.pad
+def _plain_servo(one: simulator.Simulator, rows: list[list[float]], motion: Trajectory) -> None:
+    bullet, arm, pad = one.bullet, one.arm, one.pad
     driven = [*arm.joints, *arm.fingers]
-    forces = [*one.tool.arm.effort, simulator.FINGER_EFFORT, simulator.FINGER_EFFORT]
+    forces = [*instrument_of(motion.instrument).arm.effort, simulator.FINGER_EFFORT, simulator.FINGER_EFFORT]
     fingers = [HOLDING_RAD] * 2
     for row, following in pairwise(rows):
         bullet.setJointMotorControlArray(
@@ -165,13 +166,12 @@ def _plain_servo(one: simulator.Simulator, rows: list[list[float]], rate_hz: flo
             driven,
             bullet.POSITION_CONTROL,
             targetPositions=row + fingers,
-            targetVelocities=[(b - a) * rate_hz for a, b in zip(row, following, strict=True)] + [0.0, 0.0],
+            targetVelocities=[(b - a) * motion.rate_hz for a, b in zip(row, following, strict=True)] + [0.0, 0.0],
             forces=forces,
             positionGains=[simulator.POSITION_GAIN] * 8,
             velocityGains=[simulator.VELOCITY_GAIN] * 8,
-            physicsClientId=client,
         )
-        bullet.stepSimulation(physicsClientId=client)
-        bullet.getJointStates(arm.number, arm.joints, physicsClientId=client)
-        bullet.getLinkState(arm.number, arm.tool, 0, 1, physicsClientId=client)
-        bullet.getContactPoints(arm.number, pad, physicsClientId=client)
+        bullet.stepSimulation()
+        bullet.getJointStates(arm.number, arm.joints)
+        bullet.getLinkState(arm.number, arm.tool, 0, 1)
+        bullet.getContactPoints(arm.number, pad)
