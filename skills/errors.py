@@ -223,6 +223,10 @@ class NotMetres(BadRecording):
     """A magnitude cannot be metres of a PSM; it is never rescaled by guess."""
 
 
+class ImplausibleMotion(BadRecording):
+    """No PSM moves so, or no recorder samples so: times or lengths are in another unit, or the tip jumps."""
+
+
 class NotAQuaternion(BadRecording):
     """A quaternion does not have length one."""
 

@@ -21,6 +21,7 @@ from skills.formats.ee_csv import is_header, read_ee_csv
 from skills.formats.extract import is_extract, read_extract
 from skills.formats.jigsaws import looks_like_kinematics, read_jigsaws
 from skills.formats.mcap import MAGIC
+from skills.formats.pace import check_pace
 from skills.formats.rosbag import DB3_MAGIC, ROS1_MAGIC, read_rosbag
 from skills.formats.tables import ReadingOptions, read_table
 from skills.remedies import Action, Remedy
@@ -144,6 +145,7 @@ def read_recording(
         if field.name not in ("frame", "untimed") and getattr(options, field.name) != field.default:
             raise BadSettings(f"This is {found.name}, which has its own stamps, columns and arms; omit {field.name}.")
     recording = found.read(file, options)
+    check_pace(recording, options)
     own_bases = recording.format == "lerobot" and frame == BASE  # of each arm: PSM1_base, PSM2_base
     return recording if found.is_stated or own_bases else _in_frame(recording, frame)
 

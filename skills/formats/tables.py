@@ -33,6 +33,7 @@ from typing import BinaryIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
+from skills.demonstration.plausible import MOST_HZ
 from skills.demonstration.recording import (
     Column,
     Recording,
@@ -60,7 +61,6 @@ from skills.remedies import Action, Remedy, did_you_mean
 TOPIC = "table"
 DEFAULT_ARM = "PSM"
 NOT_ENDED = ("last row", "It has no line end: if the file was cut, its last number lacks digits.")
-_FASTEST_HZ = 100_000.0
 
 LENGTHS: Mapping[str, float] = {"m": 1000.0, "mm": 1.0}  # in mm
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": np.pi / 180}  # in rad
@@ -121,8 +121,8 @@ class ReadingOptions:
     untimed: bool = False
 
     def __post_init__(self) -> None:
-        if self.rate_hz is not None and not 0 < self.rate_hz <= _FASTEST_HZ:
-            raise BadSettings(f"rate_hz is {self.rate_hz}; give samples per second, above 0 and up to {_FASTEST_HZ:g}.")
+        if self.rate_hz is not None and not 0 < self.rate_hz <= MOST_HZ:
+            raise BadSettings(f"rate_hz is {self.rate_hz}; give samples per second, above 0 and up to {MOST_HZ:g}.")
         if self.decimal not in ("point", "comma"):
             raise BadSettings(f"decimal is {self.decimal!r}; it is point or comma.")
         if self.instrument is not None:
@@ -182,8 +182,6 @@ def read_table(file: BinaryIO, reading: ReadingOptions | None = None) -> Recordi
     if not is_ended:
         cells.check_last_number(file, separator, options.decimal)
     stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, options)
-    if time is not None and time.unit != "s":
-        check_steps(names[time.index], time.unit, stamps_ns)
     columns = {
         name: scaled(found[:, 0], QUANTITIES[name][use.unit])
         for found, (name, use) in zip(numbers.groups, uses.items(), strict=True)
@@ -408,22 +406,6 @@ def stamps_of(stamps_ns: Ints | None, count: int, options: ReadingOptions) -> In
         return stamps_ns
     even: Ints = np.rint(np.arange(count) * (1e9 / (options.rate_hz or 1.0))).astype(np.int64)
     return even
-
-
-def check_steps(column: str, unit: str, stamps_ns: Ints) -> None:
-    """Refuse times that no recorder has: in another unit they would be plausible.
-
-    Raises:
-        BadColumns: The median step between different stamps is shorter than at `_FASTEST_HZ`.
-    """
-    steps_ns = np.diff(stamps_ns)
-    steps_ns = steps_ns[steps_ns > 0]
-    if len(steps_ns) and np.median(steps_ns) < 1e9 / _FASTEST_HZ:
-        raise BadColumns(
-            f"The times of the column {column} are {np.median(steps_ns):g} ns apart, read as {unit}; in which unit are "
-            "they? Name their column as t_s=NAME, t_ms=NAME, t_us=NAME or t_ns=NAME.",
-            column=column,
-        )
 
 
 def _rotation_xyzw(table: _Table) -> Floats | None:

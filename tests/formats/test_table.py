@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from skills import errors
 from skills.formats import read_recording
 from skills.formats.columns import OUTSIDE_MM, quaternion_of_rpy
-from skills.formats.tables import read_table
+from skills.formats.tables import ReadingOptions, read_table
 from skills.kinematics import INSERTION, INSTRUMENTS, forward
 from tests.by_day import examples
 
@@ -83,7 +83,8 @@ def test_roll_pitch_yaw_turn_about_fixed_axes_x_then_y_then_z():
 def test_any_table_is_read_to_the_last_digit(rows):
     stamps = np.cumsum([row[0] for row in rows]).tolist()
     lines = [f"{t // 10**9}.{t % 10**9:09d},{x!r},{y!r},{z!r}" for t, (_, x, y, z) in zip(stamps, rows, strict=True)]
-    motion = read("\n".join(["t_s,x_mm,y_mm,z_mm", *lines]), frame="camera").motion_of()
+    text = "\n".join(["t_s,x_mm,y_mm,z_mm", *lines])
+    motion = read_table(io.BytesIO(text.encode()), ReadingOptions(frame="camera")).motion_of()
     assert motion.stamps_ns.tolist() == stamps
     assert motion.tip_mm.tolist() == [list(row[1:]) for row in rows]
 
