@@ -207,6 +207,10 @@ class MixedFrames(BadRecording):
     """The poses of one topic are in more than one frame."""
 
 
+class MixedSources(BadRecording):
+    """Two publishers write to one topic at the same time."""
+
+
 class BackwardStamps(BadRecording):
     """Time stamps decrease, more often or by more than can be dropped."""
 

@@ -16,10 +16,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skills.arrays import Flags, Floats, Ints, frozen
-from skills.errors import BackwardStamps, NotAQuaternion, NotFinite, NotMetres, NoUsableTopic, RepeatedStamps
+from skills.errors import (
+    BackwardStamps,
+    ImplausibleMotion,
+    NotAQuaternion,
+    NotFinite,
+    NotMetres,
+    NoUsableTopic,
+    RepeatedStamps,
+)
 
 COORDINATE_LIMIT_MM = 1000.0  # ours: a PSM reaches 0.3 m; far beyond it millimetres were taken for metres
 QUATERNION_TOLERANCE = 1e-3  # ours: three printed decimals pass, an unnormalised quaternion does not
+UNSET_NS, SET_NS = 10**15, 10**17  # 11 days and 3 years after 1970: of a clock that was not set, and of one that was
 DROPPED_SHARE_LIMIT = 0.01  # ours: a real bag loses 1 of 3300; with more, the stamps are not the times of the samples
 DROPPED_GAP_NS = 50_000_000  # ours: a tip at 100 mm/s moves by 5 mm in it, one cell of the paper's grid
 
@@ -97,7 +106,7 @@ def check_finite(topic: str, stamps_ns: Ints, values: Floats) -> None:
 
 
 def check_forwards(topic: str, stamps_ns: Ints) -> None:
-    """Refuse time stamps that run backwards; equal stamps pass.
+    """Refuse time stamps that run backwards, and those before a clock was set; equal stamps pass.
 
     Args:
         topic: The topic, for the message.
@@ -105,6 +114,7 @@ def check_forwards(topic: str, stamps_ns: Ints) -> None:
 
     Raises:
         BackwardStamps: A stamp is earlier than the one before it.
+        ImplausibleMotion: The first are days after 1970 and later ones years.
     """
     back = stamps_ns[1:] < stamps_ns[:-1]
     if back.any():
@@ -116,6 +126,15 @@ def check_forwards(topic: str, stamps_ns: Ints) -> None:
             topic=topic,
             sample=first,
             step_s=step_s,
+        )
+    if len(stamps_ns) and stamps_ns[0] < UNSET_NS and stamps_ns[-1] > SET_NS:
+        first = int(np.searchsorted(stamps_ns, UNSET_NS))
+        raise ImplausibleMotion(
+            f"{topic}: the clock was not set in {first} sample{'s' * (first > 1)} at the start: the stamp is "
+            f"{stamps_ns[first - 1] / 1e9:g} s, and the next one {stamps_ns[first] / 1e9:.9g} s. Cut the recording "
+            f"before sample {first}.",
+            topic=topic,
+            sample=first,
         )
 
 

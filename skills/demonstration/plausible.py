@@ -1,6 +1,6 @@
 """Whether times and positions of a motion are possible for a PSM, or in another unit than they were read in.
 
-    stamps_ns (T,), tip_mm (T, 3) --pace_of--> Pace: samples per second, and the speed of the tip
+    seconds (T,), tip_mm (T, 3) --pace_of--> Pace: samples per second, and the speed of the tip
 
 The *pace* speed is that of the path, not of the time: half of the path is travelled faster, so rests do not count, and
 neither do a few samples with a late stamp. In all hand-offs and trials that we have it is 9 to 90 mm/s. It is
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skills.arrays import Floats, Ints
+from skills.arrays import Floats
 from skills.errors import ImplausibleMotion
 
 TIP_MM_S = 1000.0
@@ -23,7 +23,7 @@ LEAST_MM_S = 1.0  # slower than the drift of a held hand
 MOST_HZ = 100_000.0
 USUAL_MM_S = (5.0, 150.0)
 USUAL_HZ = 250.0  # of columns that record a motion above USUAL_MM_S: pictures have at most 60 Hz, the dVRK has 100
-WINDOW_NS = 50_000_000
+WINDOW_S = 0.05
 WINDOWS = 2000  # evenly spaced, however long the recording is
 
 
@@ -39,31 +39,27 @@ class Pace(NamedTuple):
         least, most = USUAL_MM_S
         return LEAST_HZ <= self.rate_hz <= MOST_HZ and (self.speed_mm_s == 0.0 or least <= self.speed_mm_s <= most)
 
-    def times(self, factor: float) -> "Pace":
-        """Return the pace if the times were multiplied by a factor."""
-        return Pace(self.rate_hz / factor, self.speed_mm_s / factor)
-
     def __str__(self) -> str:
         """Return it in words."""
         rate, speed = (f"{one:.3g}" if one < 1000 else f"{one:.0f}" for one in self)
         return f"{rate} poses per second, and half of the path at more than {speed} mm/s"
 
 
-def pace_of(stamps_ns: Ints, tip_mm: Floats) -> Pace:
-    """Measure the pace of a motion in windows of `WINDOW_NS`.
+def pace_of(seconds: Floats, tip_mm: Floats) -> Pace:
+    """Measure the pace of a motion in windows of `WINDOW_S`.
 
     Args:
-        stamps_ns: Integer nanoseconds, shape (T,), strictly increasing, T at least 2.
+        seconds: Times from any near origin, shape (T,), strictly increasing, T at least 2.
         tip_mm: Positions, shape (T, 3).
     """
-    first = np.unique(np.linspace(0, len(stamps_ns) - 2, WINDOWS).astype(np.int64))
-    last = np.searchsorted(stamps_ns, stamps_ns[first] + WINDOW_NS).clip(first + 1, len(stamps_ns) - 1)
+    first = np.unique(np.linspace(0, len(seconds) - 2, WINDOWS).astype(np.int64))
+    last = np.searchsorted(seconds, seconds[first] + WINDOW_S).clip(first + 1, len(seconds) - 1)
     way_mm = np.linalg.norm(tip_mm[last] - tip_mm[first], axis=1)
-    speed = way_mm / ((stamps_ns[last] - stamps_ns[first]) / 1e9)
+    speed = way_mm / (seconds[last] - seconds[first])
     order = np.argsort(speed)
     travelled = np.cumsum(way_mm[order])
     middle = order[np.searchsorted(travelled, travelled[-1] / 2)]
-    return Pace(1e9 / float(np.median(stamps_ns[first + 1] - stamps_ns[first])), float(speed[middle]))
+    return Pace(1.0 / float(np.median(seconds[first + 1] - seconds[first])), float(speed[middle]))
 
 
 def check_steps(topic: str, stamps_s: Floats, tip_mm: Floats) -> None:

@@ -5,10 +5,12 @@ that no hand-off has, with units from the names alone, is asked about. Who state
 answered.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from skills.demonstration.plausible import LEAST_HZ, MOST_HZ, TIP_MM_S, USUAL_HZ, USUAL_MM_S, Pace, pace_of
-from skills.demonstration.recording import Recording
+from skills.demonstration.recording import Motion, Recording
 from skills.errors import ImplausibleMotion
 from skills.formats.cells import NS_PER
 from skills.formats.tables import ReadingOptions
@@ -26,12 +28,11 @@ def check_pace(recording: Recording, options: ReadingOptions) -> None:
     moved = [motion for motion in recording.motions if len(motion.stamps_ns) >= FEWEST]
     if not moved or (options.untimed and options.rate_hz is None and not recording.is_timed):
         return  # too short to be judged, or a preview of a table without times
-    paces = [pace_of(motion.stamps_ns, motion.tip_mm) for motion in moved]
-    pace = Pace(max(one.rate_hz for one in paces), max(one.speed_mm_s for one in paces))
+    pace = _pace(moved)
     fault = _impossible(pace) or (_unusual(recording, pace) if _is_declared(recording, options) else None)
     if fault is not None:
         raise ImplausibleMotion(
-            f"{_times(recording, options)} give {pace}: {fault}. {_fitting(recording, pace)}",
+            f"{_times(recording, options)} give {pace}: {fault}. {_fitting(recording, moved)}",
             rate_hz=pace.rate_hz,
             speed_mm_s=pace.speed_mm_s,
         )
@@ -72,14 +73,20 @@ def _times(recording: Recording, options: ReadingOptions) -> str:
     return "The stamps" if options.rate_hz is None else f"The positions at {options.rate_hz:g} Hz"
 
 
-def _fitting(recording: Recording, pace: Pace) -> str:
+def _pace(motions: Sequence[Motion], factor: float = 1.0) -> Pace:
+    """Return the pace of the motions with the highest, if their times were multiplied by a factor."""
+    paces = [pace_of((one.stamps_ns - one.stamps_ns[0]) * (factor / 1e9), one.tip_mm) for one in motions]
+    return Pace(max(one.rate_hz for one in paces), max(one.speed_mm_s for one in paces))
+
+
+def _fitting(recording: Recording, moved: Sequence[Motion]) -> str:
     """Return the unit of time that would make sense, or what to do if there is none."""
     time = next((column for column in recording.columns if column.quantity == "t"), None)
     known = NS_PER if time is None else {unit: ns for unit, ns in NS_PER.items() if unit != time.unit}
     own_ns = 1_000_000_000 if time is None else NS_PER[time.unit]
     for unit, ns in known.items():
         for factor in {ns / own_ns} if time is not None else {ns / own_ns, own_ns / ns}:
-            if factor != 1 and (found := pace.times(factor)).is_usual:
+            if factor != 1 and (found := _pace(moved, factor)).is_usual:
                 if time is None:
                     return f"Times {factor:g} times as long would give {found}: correct their unit."
                 return (

@@ -275,8 +275,8 @@ def _topics(reader: AnyReader) -> tuple[Topic, ...]:
 def _messages(reader: AnyReader, used: Sequence[Any]) -> Iterator[Message]:
     """Yield the messages of some connections as CDR."""
     for connection, log_ns, data in reader.messages(connections=used):
-        kind = connection.msgtype
-        yield Message(log_ns, connection.topic, kind, data if reader.is2 else _cdr(data, kind))
+        kind, publisher = connection.msgtype, getattr(connection.ext, "callerid", None) or ""
+        yield Message(log_ns, connection.topic, kind, data if reader.is2 else _cdr(data, kind), publisher)
 
 
 def _cdr(data: bytes, kind: str) -> bytes:

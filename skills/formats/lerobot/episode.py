@@ -30,7 +30,15 @@ import numpy as np
 
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic
-from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
+from skills.errors import (
+    BackwardStamps,
+    BadColumns,
+    ImplausibleMotion,
+    MixedFrames,
+    NotFinite,
+    NoUsableTopic,
+    UnreadableRecording,
+)
 from skills.formats import columns
 from skills.formats.archive import printable
 from skills.formats.lerobot import INFO, STATEMENTS, VERSIONS, Dataset, Feature, Files, read_dataset
@@ -40,6 +48,8 @@ from skills.remedies import Action, Remedy, did_you_mean
 
 NOTE_CHARACTERS = 200
 COARSE_S = 1e-3  # timestamps that are coarser, a float32 after 2.3 hours or in seconds since 1970, are no clock
+RATE_FACTOR, FEWEST_STEPS = 1.25, 3  # ours: recorders of 30 pictures a second really take 28
+CLOCK = "the recorder's clock"
 SAME_S = 1e-4  # LeRobot's own tolerance between timestamps and its rate
 
 _POSE = re.compile(
@@ -96,6 +106,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         commanded = {}
     _check_one_episode(dataset, table)
     stamps_ns, clock = _stamps_ns(dataset, table)
+    _check_rate(dataset, table, stamps_ns, clock)
     stamps_ns.setflags(write=False)  # so that all streams share it
     values = _values(table, meanings)
     tools = _tools(dataset, table)
@@ -425,7 +436,7 @@ def _stamps_ns(dataset: Dataset, table: ParquetTable) -> tuple[Ints, str]:
     if sec is not None and nanosec is not None:
         if not ((np.abs(sec) < 2**33) & (np.rint(sec) == sec) & (nanosec >= 0) & (nanosec < 1e9)).all():
             raise UnreadableRecording(f"{_SEC} and {_NANOSEC} are not whole seconds and nanoseconds of a clock.")
-        return sec.astype(np.int64) * 1_000_000_000 + np.rint(nanosec).astype(np.int64), "the recorder's clock"
+        return sec.astype(np.int64) * 1_000_000_000 + np.rint(nanosec).astype(np.int64), CLOCK
     frames, seconds = table.column("frame_index"), table.column("timestamp")
     frames = np.arange(table.rows, dtype=np.float64) if frames is None else frames
     if not ((frames >= 0) & (frames < 2**40)).all():
@@ -447,6 +458,26 @@ def _stamps_ns(dataset: Dataset, table: ParquetTable) -> tuple[Ints, str]:
     if step_s > COARSE_S:
         return _in_ns(even_s), f"{rate}; timestamp has steps of {step_s:g} s"
     return _in_ns(seconds), "timestamp, in single precision"
+
+
+def _check_rate(dataset: Dataset, table: ParquetTable, stamps_ns: Ints, clock: str) -> None:
+    """Refuse stamps that contradict the rate of the dataset.
+
+    Raises:
+        ImplausibleMotion: The median step is not that of `fps`, within a factor of `RATE_FACTOR`.
+    """
+    frames = table.column("frame_index")
+    steps = np.ones(table.rows - 1) if frames is None else np.diff(frames)
+    if len(steps) < FEWEST_STEPS or clock == CLOCK:  # which is in seconds and nanoseconds, whatever the fps are
+        return
+    step_s = float(np.median(np.diff(stamps_ns) / 1e9 / steps))
+    if step_s > 0 and not 1 / RATE_FACTOR <= step_s * dataset.fps <= RATE_FACTOR:
+        raise ImplausibleMotion(
+            f"The frames of the episode are {step_s:.6g} s apart by {clock}, and {1 / dataset.fps:.6g} s by the fps of "
+            f"{dataset.fps:g} in {INFO}: one of them is wrong, or in another unit. Correct it.",
+            step_s=step_s,
+            fps=dataset.fps,
+        )
 
 
 def _in_ns(seconds: Floats) -> Ints:

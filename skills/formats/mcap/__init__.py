@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from skills.arrays import Floats, Ints
 from skills.demonstration import recording
-from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
+from skills.errors import ImplausibleMotion, MixedFrames, MixedSources, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats import topics
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Field, Wanted, fields_of
 from skills.formats.mcap.reader import MAGIC, Channel, MessageSchema, Part, Walker
@@ -35,11 +35,16 @@ from skills.kinematics import INSERTION
 
 __all__ = ["MAGIC", "NeedsRosbags", "read_mcap"]
 
+OVERLAP_NS = 1_000_000_000  # ours: parts of a bag overlap by some messages, a restarted node not at all
+CLOCK_S = 0.5  # ours: shorter recordings are not compared with the time of their reception
+DECADE = 0.01  # ours, as a logarithm: 2 %
+NOTE_LIMIT = 500
 TOOL_LIMIT = 200  # characters of an instrument's name
 MeaningOf = Callable[[str, str], Meaning | None]  # of a topic and its message type
 
 _POSITION = Wanted(("position",), first=True)
 _ANGLES = (TopicKind.JAW, TopicKind.GRIPPER, TopicKind.JAW_SETPOINT)  # continuous values, the first of a joint state
+_MOVING = (TopicKind.MOTION, TopicKind.MASTER, TopicKind.SETPOINT, TopicKind.JOINTS, *_ANGLES)
 _WANTED = {
     topics.POSE: WANTED_POSE,
     topics.TRANSFORM: Wanted(
@@ -90,11 +95,17 @@ class _Topic:
     name: str
     meaning: Meaning
     columns: list[Columns] = field(default_factory=list)
+    channels: list[Channel] = field(default_factory=list)  # of each of the columns
 
     @property
     def is_needed(self) -> bool:
         """True if a demonstration needs the topic."""
         return self.meaning.kind in (TopicKind.MOTION, TopicKind.JAW) or self.name in topics.CLUTCH_TOPICS
+
+    @property
+    def is_unset(self) -> bool:
+        """True if the stamps of all headers are 0, which in ROS means that the driver sets none."""
+        return bool(self.columns) and not any(one.stamps_ns is None or one.stamps_ns.any() for one in self.columns)
 
 
 @dataclass
@@ -118,6 +129,7 @@ class _Log:
             topic = self.topics[channel.topic]
             try:
                 topic.columns.append(decoder.decode(part.data, *part.of(number)))
+                topic.channels.append(channel)
             except SkillsError as error:
                 self.leave_out(topic, error)
 
@@ -133,6 +145,7 @@ class _Log:
             raise error
         self.left_out[topic.name] = str(error)
         topic.columns.clear()
+        topic.channels.clear()
 
     def type_of(self, channel: Channel) -> str:
         """Return the message type of a channel; "" for a channel without schema."""
@@ -226,7 +239,7 @@ def _recording(log: _Log) -> recording.Recording:
         following=signals[TopicKind.FOLLOWING],
         scales=signals[TopicKind.SCALE],
         tools=tuple(found[TopicKind.TOOL]),
-        notes=tuple(sorted(log.walker.notes.items())),
+        notes=(*sorted(log.walker.notes.items()), *_reception(log)),
         left_out=tuple(sorted(log.left_out.items())),
         setpoints=values[TopicKind.SETPOINT],
         jaw_setpoints=signals[TopicKind.JAW_SETPOINT],
@@ -308,12 +321,83 @@ def _in_order(topic: _Topic) -> tuple[Ints, Floats]:
             f"{topic.name} has messages with {widths[0]} and {widths[1]} values; record them on separate topics.",
             topic=topic.name,
         )
+    _check_one_source(topic)
     stamps_ns = _concatenated(list(_stamps(topic)))
+    _check_clocks(topic.name, stamps_ns, log_ns)
     values = _concatenated([columns.values for columns in topic.columns])
     if (log_ns[1:] >= log_ns[:-1]).all():
         return stamps_ns, values
     order = np.argsort(log_ns, kind="stable")  # messages of the same log time stay in the file's order
     return stamps_ns[order], values[order]
+
+
+def _check_one_source(topic: _Topic) -> None:
+    """Refuse a topic on which two publishers write at the same time: their poses would be woven into one motion.
+
+    Raises:
+        MixedSources: Two channels overlap in time by more than `OVERLAP_NS`, and do not repeat the same messages.
+    """
+    found: dict[int, list[Columns]] = {}
+    for channel, columns in zip(topic.channels, topic.columns, strict=True):
+        found.setdefault(channel.number, []).append(columns)
+    if len(found) == 1 or topic.meaning.kind not in _MOVING:
+        return
+    spans = sorted(
+        (min(int(c.log_ns.min()) for c in some), max(int(c.log_ns.max()) for c in some), number)
+        for number, some in found.items()
+    )
+    (_, end, one), *later = spans
+    for start, other_end, other in later:
+        if min(end, other_end) - start > OVERLAP_NS and not _repeats(found[one], found[other]):
+            named = {channel.number: f"{channel.number} {channel.publisher}".strip() for channel in topic.channels}
+            raise MixedSources(
+                f"{topic.name} has two publishers at the same time, on the channels {named[one]} and {named[other]}; "
+                "their poses are not one motion. Stop one of them, or keep one channel of the recording.",
+                topic=topic.name,
+                channels=[one, other],
+            )
+        end, one = max((end, one), (other_end, other))
+
+
+def _repeats(some: list[Columns], others: list[Columns]) -> bool:
+    """Return whether the messages of the shorter of two channels are all on the other one too."""
+    both = [
+        (
+            np.concatenate([c.log_ns.view(np.int64) if c.stamps_ns is None else c.stamps_ns for c in one]),
+            np.concatenate([c.values for c in one]),
+        )
+        for one in (some, others)
+    ]
+    (fewer_ns, fewer), (more_ns, more) = sorted(both, key=lambda one: len(one[0]))
+    order = np.argsort(more_ns)
+    at = order[np.searchsorted(more_ns, fewer_ns, sorter=order).clip(max=len(order) - 1)]
+    return bool((more_ns[at] == fewer_ns).all() and (more[at] == fewer).all())
+
+
+def _check_clocks(topic: str, stamps_ns: Ints, log_ns: NDArray[np.uint64]) -> None:
+    """Refuse stamps in another unit than their seconds: beside them is the time of reception.
+
+    Raises:
+        ImplausibleMotion: The stamps last a power of ten as long as the reception.
+    """
+    logged_s, stamped_s = float(np.ptp(log_ns)) / 1e9, float(np.ptp(stamps_ns)) / 1e9
+    if min(logged_s, stamped_s) > 0 and max(logged_s, stamped_s) >= CLOCK_S:
+        decades = np.log10(stamped_s / logged_s)
+        if abs(decades) > 0.5 and abs(decades - round(decades)) < DECADE:
+            raise ImplausibleMotion(
+                f"{topic}: its stamps last {stamped_s:.6g} s, and its messages were received within {logged_s:.6g} s: "
+                "the stamps are in another unit. Correct them, or the node that sets them.",
+                topic=topic,
+                stamped_s=stamped_s,
+                logged_s=logged_s,
+            )
+
+
+def _reception(log: _Log) -> list[tuple[str, str]]:
+    """Return the note that names the topics without stamps."""
+    unset = sorted(topic.name for topic in log.topics.values() if topic.is_unset)
+    words = f"the time of reception, since the stamps of all headers are 0: {', '.join(unset)}"
+    return [("stamps", words[:NOTE_LIMIT])] if unset else []
 
 
 def _concatenated(arrays: list[NDArray[Any]]) -> NDArray[Any]:
@@ -323,7 +407,7 @@ def _concatenated(arrays: list[NDArray[Any]]) -> NDArray[Any]:
 
 def _stamps(topic: _Topic) -> Iterable[Ints]:
     for columns in topic.columns:
-        if columns.stamps_ns is not None:
+        if columns.stamps_ns is not None and not topic.is_unset:
             yield columns.stamps_ns
         elif columns.log_ns.max() < 2**63:
             yield columns.log_ns.astype(np.int64)
