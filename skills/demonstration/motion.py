@@ -27,6 +27,7 @@ from skills.errors import (
 )
 
 COORDINATE_LIMIT_MM = 1000.0  # ours: a PSM reaches 0.3 m; far beyond it millimetres were taken for metres
+JAW_RAD = np.pi  # ours: instruments open by 1.4 rad and close to -0.7, JIGSAWS has -1.9 to 0.6; degrees exceed it
 QUATERNION_TOLERANCE = 1e-3  # ours: three printed decimals pass, an unnormalised quaternion does not
 UNSET_NS, SET_NS = 10**15, 10**17  # 11 days and 3 years after 1970: of a clock that was not set, and of one that was
 DROPPED_SHARE_LIMIT = 0.01  # ours: a real bag loses 1 of 3300; with more, the stamps are not the times of the samples
@@ -388,7 +389,17 @@ def recorded_signal(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
     Raises:
         BackwardStamps: As in `forward_samples`.
         NotFinite: A value is NaN or infinite.
+        NotMetres: An angle is beyond `JAW_RAD`.
     """
+    wide = np.abs(values) > JAW_RAD
+    if wide.any() and np.isfinite(values).all():  # those that are not are refused below
+        first = int(np.argmax(wide))
+        raise NotMetres(
+            f"{topic}: a jaw's angle of {values[first]:g} rad {_at(stamps_ns, first)}; a jaw opens by less than "
+            f"{JAW_RAD:.4g} rad. Is it in degrees? Give radians, or name the unit of the column, as in jaw_deg.",
+            topic=topic,
+            sample=first,
+        )
     kept, _, backward = forward_samples(topic, stamps_ns, values, equal_stamps=True)
     if kept is None:
         return Signal(stamps_ns, values, topic)

@@ -77,6 +77,13 @@ QUANTITIES: Mapping[str, Mapping[str, float]] = {
     "clutch": PLAIN,
     **{name: LENGTHS if unit == "mm" else ANGLES for name, unit in zip(JOINT_NAMES, UNITS, strict=True)},
 }
+# Ours: the greatest number of an orientation, of joints or of a jaw, if it is in radians. Smaller ones are no motion.
+_RADIANS: Mapping[tuple[str, ...], tuple[float, float]] = {
+    RPY: (0.5, np.pi),
+    ROTATION_VECTOR: (0.5, np.pi),
+    tuple(name for name in JOINT_NAMES if QUANTITIES[name] is ANGLES): (0.1, 4.6),
+    ("jaw",): (0.3, 1.6),
+}
 KNOWN = (
     "t_s (or t_ms, t_us, t_ns), x_m, y_m, z_m (or _mm), qx, qy, qz, qw, roll_rad, pitch_rad, yaw_rad, rx_rad, ry_rad, "
     "rz_rad, jaw_rad (or _deg), clutch, q1_rad, q2_rad, q3_m, q4_rad, q5_rad, q6_rad"
@@ -186,6 +193,7 @@ def read_table(file: BinaryIO, reading: ReadingOptions | None = None) -> Recordi
         name: scaled(found[:, 0], QUANTITIES[name][use.unit])
         for found, (name, use) in zip(numbers.groups, uses.items(), strict=True)
     }
+    _check_degrees(names, uses, columns)
     meant = {use.index: (quantity, use.unit) for quantity, use in uses.items()}
     listed = tuple(Column(name, *meant.get(index, ("", ""))) for index, name in enumerate(names))
     recording = _recording(_Table(columns, stamps_ns), options, listed)
@@ -408,11 +416,32 @@ def stamps_of(stamps_ns: Ints | None, count: int, options: ReadingOptions) -> In
     return even
 
 
+def _check_degrees(names: Sequence[str], uses: Mapping[str, _Use], columns: Mapping[str, Floats]) -> None:
+    """Ask about degrees that stay within the numbers that radians have.
+
+    Raises:
+        BadColumns: The greatest number of a group is within its limits in `_RADIANS`.
+    """
+    for group, (least, most) in _RADIANS.items():
+        read = {name: np.degrees(columns[name]) for name in group if name in uses and uses[name].unit == "deg"}
+        greatest = max((float(np.abs(values).max()) for values in read.values()), default=0.0)
+        if least <= greatest <= most:
+            name = next(iter(read))
+            first = names[uses[name].index][:80]
+            raise BadColumns(
+                f"The angles of {', '.join(read)} are at most {greatest:.3g}, read as degrees; radians have such "
+                f"numbers. Name the columns with the right unit, as in {name}_rad={first}; if they are degrees, give "
+                "them in radians.",
+                column=first,
+                greatest=greatest,
+            )
+
+
 def _rotation_xyzw(table: _Table) -> Floats | None:
     if QUATERNION[0] in table.columns:
         return table.stacked(QUATERNION)
     if RPY[0] in table.columns:
-        return quaternion_of_rpy(table.stacked(RPY))
+        return quaternion_of_rpy(TOPIC, table.stacked(RPY))
     return quaternion_of_vector(TOPIC, table.stacked(ROTATION_VECTOR)) if ROTATION_VECTOR[0] in table.columns else None
 
 

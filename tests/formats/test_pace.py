@@ -207,7 +207,7 @@ def test_two_publishers_in_a_bag_of_ros_1_are_named(tmp_path):
 def test_two_arms_woven_into_one_channel_are_no_motion():
     seconds, tip = stroke()
     tip[::2] += [30.0, -10.0, 5.0]
-    with pytest.raises(errors.ImplausibleMotion, match="699 of 699 steps are such jumps.*two sources"):
+    with pytest.raises(errors.ImplausibleMotion, match=r"699 of 699 steps are such jumps.*two sources"):
         cut_demo(read(mcap(in_ns(seconds), tip)))
 
 

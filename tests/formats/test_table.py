@@ -63,7 +63,7 @@ def test_roll_pitch_yaw_turn_about_fixed_axes_x_then_y_then_z():
         @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
         @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     )
-    ((x, y, z, w),) = quaternion_of_rpy(np.array([[roll, pitch, yaw]]))
+    ((x, y, z, w),) = quaternion_of_rpy("table", np.array([[roll, pitch, yaw]]))
     matrix = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],

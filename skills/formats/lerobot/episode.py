@@ -29,7 +29,7 @@ from dataclasses import replace
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic
+from skills.demonstration.recording import Joints, Motion, Recording, Topic, recorded_signal
 from skills.errors import (
     BackwardStamps,
     BadColumns,
@@ -115,6 +115,8 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         for (arm, kind), one in values.items()
         if kind == "joints"
     }
+    for one in joints.values():
+        columns.check_joints(one.topic, one.positions)
     motions, left_out = _motions(values, joints, tools, stamps_ns, _frames(dataset, frame, {arm for arm, _ in values}))
     instruments = {arm: number for arm, tool in tools.items() if (number := _number(tool)) is not None}
     tips, jaw_setpoints, unusable = columns.setpoints_in(_values(table, commanded), motions, instruments, stamps_ns)
@@ -123,7 +125,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
         motions=motions,
         jaws=tuple(
-            (arm, Signal(stamps_ns, one[0][:, 0], columns.topic_of(arm, kind)))
+            (arm, recorded_signal(stamps_ns, one[0][:, 0], columns.topic_of(arm, kind)))
             for (arm, kind), one in values.items()
             if kind == "jaw"
         ),

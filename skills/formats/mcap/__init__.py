@@ -27,6 +27,7 @@ from skills.arrays import Floats, Ints
 from skills.demonstration import recording
 from skills.errors import ImplausibleMotion, MixedFrames, MixedSources, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats import topics
+from skills.formats.columns import check_joints
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Field, Wanted, fields_of
 from skills.formats.mcap.reader import MAGIC, Channel, MessageSchema, Part, Walker
 from skills.formats.mcap.records import RECOVER
@@ -282,6 +283,7 @@ def _joints(topic: _Topic) -> recording.Joints:
             raise NoUsableTopic(f"{topic.name} has {positions.shape[1]} joints; a PSM has 6.", topic=topic.name)
         with np.errstate(over="ignore"):  # infinite values are refused below
             positions[:, INSERTION] *= 1000.0  # ROS messages are in metres
+        check_joints(topic.name, positions)
     return recording.recorded_joints(topic.meaning.owner, topic.name, stamps_ns, positions)
 
 
