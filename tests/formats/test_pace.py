@@ -11,7 +11,7 @@ from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.plausible import TIP_MM_S, pace_of
 from skills.formats import read_recording, topics
 from skills.formats.bag_writer import joint_state, pose, write_messages
-from tests.formats import lerobots, others
+from tests.formats import lerobots, others, scalings
 from tests.formats.bags import START_NS, STEP_NS
 from tests.formats.others import zipped
 
@@ -226,3 +226,18 @@ def test_a_restarted_node_is_no_second_source():
 def test_a_single_pose_is_refused_in_words_where_it_is_cut():
     with pytest.raises(errors.BadSegment, match="single pose"):
         cut_demo(read("t_s,x_mm,y_mm,z_mm\n0,1,50,-120\n"))
+
+
+# ---- scaled files of every format ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [240, pytest.param(10_000, marks=pytest.mark.nightly)])
+def test_no_file_in_another_unit_is_taken_silently_and_wrongly(count):
+    found = list(scalings.outcomes(count, seed=count))
+    assert [name for name, what in found if what == "wrong"] == []
+    assert sum(what == "refused" for _, what in found) > 0.9 * count
+
+
+@pytest.mark.parametrize("count", [120, pytest.param(2000, marks=pytest.mark.nightly)])
+def test_no_sound_file_is_refused(count):
+    assert {what for _, what in scalings.outcomes(count, seed=1, are_sound=True)} == {"right"}
