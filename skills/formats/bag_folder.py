@@ -5,7 +5,7 @@ dataset (see `lerobot`), or one JIGSAWS trial.
 
     session/
         rosbag_1/metadata.yaml     the bag's files in order, and their numbers of messages
-        rosbag_1/rosbag_1_0.mcap   one file or several; also .mcap.zstd, .db3, or .bag of ROS 1
+        rosbag_1/rosbag_1_0.mcap   one file or several; also .mcap.zstd, .db3 (with its -wal), or .bag of ROS 1
         *.json                     the tags of the recorders (see `tags`)
         *.mp4 and others           ignored
 
@@ -45,6 +45,7 @@ METADATA_PARTS, METADATA_DEPTH = 100_000, 20  # events of the parser; of 60 topi
 TEXTS = 10  # for one trial: its kinematics, a transcription, the meta files, a README
 UNZSTD_BYTES = 4 << 30
 SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".bag")
+LOGS = ("-wal", "-journal")  # of a database that was not closed, beside it
 
 _DIRECTIVE = re.compile("(?:^|[\r\n\x85\u2028\u2029])%")
 
@@ -90,7 +91,8 @@ def read_zip(file: BinaryIO, frame: str | None = None) -> Recording:
 
 def suffix_of(name: str) -> str:
     """Return the suffix that marks a file as part of a bag; "" if it is not."""
-    return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), "")
+    lower = name.lower()
+    return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if lower.endswith(suffix)), "")
 
 
 def read_metadata(text: str) -> Metadata:
@@ -218,7 +220,14 @@ def _read_bag(archive: Archive, names: list[str], bag: list[str]) -> Recording:
         if suffixes[0].startswith(".mcap"):
             recording = _read_mcaps(archive, ordered)
         else:
-            recording = read_rosbag([files.enter_context(archive.unpacked(name)) for name in ordered], suffix)
+            unpacked = [files.enter_context(archive.unpacked(name)) for name in ordered]
+            logs = {
+                number: (beside, files.enter_context(archive.unpacked(name + beside)))
+                for number, name in enumerate(ordered)
+                for beside in LOGS
+                if name + beside in names and archive.size(name + beside)
+            }
+            recording = read_rosbag(unpacked, suffix, logs=logs, counted=metadata is not None)
     if metadata is not None:
         check_counts(metadata, recording.topics)
     labels = read_labels(dict(_tags(archive, names)))
@@ -246,7 +255,7 @@ def _read_mcaps(archive: Archive, names: list[str]) -> Recording:
 @contextmanager
 def _plain(archive: Archive, name: str) -> Iterator[BinaryIO]:
     with archive.unpacked(name) as file:
-        if not name.endswith(".zstd"):
+        if not suffix_of(name).endswith(".zstd"):
             yield file
             return
         with TemporaryFile() as out:

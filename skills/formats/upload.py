@@ -13,6 +13,7 @@ Checksums of the original are verified while copying, and the copy has its own.
 """
 
 import json
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -148,7 +149,7 @@ def _one_file(bag: Bag, folder: Path, progress: Progress) -> Path:
     """Return the bag as one file without pictures; the original file if it is one already."""
     if len(bag.files) == 1 and not _can_be_rewritten(bag.files[0]):
         return bag.files[0]
-    files = [_plain_file(file, folder) for file in bag.files]
+    files = [_plain_file(file, folder, counted=bag.metadata is not None) for file in bag.files]
     if len(files) == 1 and files[0] == bag.files[0]:
         topics = topics_of(files[0]) if files[0].suffix == ".mcap" else rosbag.topics_in(files)
         if not any(topic.type in PICTURES for topic in topics):
@@ -174,7 +175,8 @@ def _can_be_rewritten(file: Path) -> bool:
     with file.open("rb") as content:
         head = content.read(16)
     kinds = {".mcap": MAGIC, ".bag": rosbag.ROS1_MAGIC, ".db3": rosbag.DB3_MAGIC, ".zstd": b"\x28\xb5\x2f\xfd"}
-    return file.suffix in kinds and head.startswith(kinds[file.suffix])
+    suffix = file.suffix.lower()
+    return suffix in kinds and head.startswith(kinds[suffix])
 
 
 def _check(bag: Bag, topics: Sequence[Topic]) -> None:
@@ -182,11 +184,27 @@ def _check(bag: Bag, topics: Sequence[Topic]) -> None:
         bag_folder.check_counts(bag.metadata, topics)
 
 
-def _plain_file(file: Path, folder: Path) -> Path:
-    """Return a file, decompressed into the folder if rosbag2 compressed it."""
-    if file.suffix != ".zstd":
-        return file
-    plain = folder / file.stem
+def _plain_file(file: Path, folder: Path, *, counted: bool) -> Path:
+    """Return a file as rosbags and MCAP's library read it, or such a copy in the folder.
+
+    One that rosbag2 compressed is decompressed, a database is merged with its log, a suffix is in small letters. A
+    database in WAL mode without its log remains as it is, so that the service refuses it, unless its messages are
+    counted.
+    """
+    suffix = file.suffix.lower()
+    if suffix != ".zstd":
+        logs = [log for log in (Path(f"{file}{beside}") for beside in bag_folder.LOGS) if log.is_file()]
+        with file.open("rb") as content:
+            is_merged = suffix == ".db3" and (bool(logs) or (counted and rosbag.is_in_wal_mode(content)))
+        if not is_merged and suffix == file.suffix:
+            return file
+        plain = folder / f"{file.stem}{suffix}"
+        for one in (file, *logs):
+            shutil.copyfile(one, f"{plain}{one.name.removeprefix(file.name)}")
+        if is_merged:
+            rosbag.merge_log(plain)
+        return plain
+    plain = folder / file.stem.lower()
     with file.open("rb") as packed, plain.open("wb") as out:
         bag_folder.unzstd(packed, out)
     return plain

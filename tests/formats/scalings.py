@@ -3,8 +3,8 @@
     python -m tests.formats.scalings [N] [SEED]    how many of N scaled files are taken silently and wrongly
 
 Times are scaled by powers of ten from 1e-9 to 1e9. Lengths in m, cm, mm or inches are written as if they were in the
-unit of the format, which is m, or in tables m or mm; angles in degrees as if they were in radians, and in tables in radians
-as if they were in degrees. Not among them are factors that no unit of a format explains: 2.54, or a jaw divided by 57.
+unit of the format, which is m, or in tables m or mm; angles in degrees as if they were in radians, in tables also the
+reverse. Not among them are factors that no unit of a format explains: 2.54, or a jaw divided by 57.
 """
 
 import io

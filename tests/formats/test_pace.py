@@ -86,7 +86,7 @@ def test_fewer_than_five_poses_a_second_are_refused_whoever_says_so(hz, how):
 def test_a_slow_or_hurried_table_is_asked_about_until_its_units_are_stated():
     seconds, tip = stroke(hz=100)
     stated = {"column": ["t_s=t_s", *(f"{axis}_mm={axis}_mm" for axis in "xyz")], "frame": "base"}
-    for factor, why in ((12.0, "faster than 5 mm/s"), (0.1, "more than 250 poses per second")):
+    for factor, why in ((12.0, "faster than 7 mm/s"), (0.1, "more than 250 poses per second")):
         with pytest.raises(errors.ImplausibleMotion, match=why):
             read(table(factor * seconds, tip))
         assert len(read(table(factor * seconds, tip), **stated).motion_of().stamps_ns) == 700

@@ -19,11 +19,20 @@ from typing import IO, Any, BinaryIO
 
 from skills.errors import BadInput, UnreadableRecording
 from skills.formats.archive import MAGIC, Archive, pack, refusing
-from skills.formats.lerobot import INFO, STATEMENTS, TASK_LINES, Dataset, Json, read_dataset, root_of
+from skills.formats.lerobot import (
+    EPISODE_LINES,
+    EPISODES,
+    INFO,
+    STATEMENTS,
+    TASK_LINES,
+    Dataset,
+    Json,
+    read_dataset,
+    root_of,
+)
 from skills.formats.lerobot.episode import several_episodes
 from skills.formats.lerobot.parquet import open_parquet, read_rows
 
-EPISODES = 100_000
 _EPISODE_FILE = re.compile(r"episode_(\d{1,9})\.parquet$")
 _DATA_FILE = re.compile(r"chunk-(\d{1,9})/file-(\d{1,9})\.parquet$")
 _KEPT = ("codebase_version", "robot_type", "fps", "splits", "features")  # of info.json; other keys may name people
@@ -137,7 +146,7 @@ def cut_episode(
         tools: Arms and the numbers of their instruments, such as PSM1 and 400006.
 
     Raises:
-        UnreadableRecording: Its file is damaged, or has other episodes.
+        UnreadableRecording: Its file is damaged, has other episodes, or not the frames that the dataset claims.
     """
     from pyarrow import Table, parquet
 
@@ -147,6 +156,7 @@ def cut_episode(
         rows: Table = _rows_of(file, episode)
         if "episode_index" in rows.column_names and set(rows["episode_index"].unique().to_pylist()) != {number}:
             raise UnreadableRecording(f"The data of episode {number} are of other episodes; copy the dataset again.")
+        dataset.check_length(number, rows.num_rows)
         if episode.rows is None and not pictures & {*rows.column_names}:
             file.seek(0)
             data = file.read()
@@ -160,7 +170,7 @@ def cut_episode(
     named = [{"task_index": task, "task": dataset.tasks[task]} for task in tasks if task in dataset.tasks]
     members[TASK_LINES] = b"\n".join(map(_json, named))
     about = {"episode_index": number, "tasks": [one["task"] for one in named], "length": rows.num_rows}
-    members["meta/episodes.jsonl"] = _json(about)
+    members[EPISODE_LINES] = _json(about)
     before = dataset.statements
     changes = {"columns": {**before.columns, **columns}} if columns else {}
     changes |= {"tools": {**before.tools, **tools}} if tools else {}

@@ -193,13 +193,7 @@ def _check_one_episode(dataset: Dataset, table: ParquetTable) -> None:
     numbers = table.column("episode_index")
     if numbers is not None and len(found := np.unique(numbers)) > 1:
         raise several_episodes(len(found))
-    claimed = dataset.info.get("total_frames")
-    if dataset.info.get("total_episodes") == 1 and claimed != table.rows:
-        raise UnreadableRecording(
-            f"{INFO} claims {printable(claimed)} frames, and the episode has {table.rows}: one of them is incomplete. "
-            "Copy the dataset again.",
-            found=table.rows,
-        )
+    dataset.check_length(None if numbers is None else int(numbers[0]), table.rows)
 
 
 # ---- columns and their meanings ------------------------------------------------------------------------------------
