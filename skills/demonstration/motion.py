@@ -31,6 +31,7 @@ JAW_RAD = np.pi  # ours: instruments open by 1.4 rad and close to -0.7, JIGSAWS 
 QUATERNION_TOLERANCE = 1e-3  # ours: three printed decimals pass, an unnormalised quaternion does not
 UNSET_NS, SET_NS = 10**15, 10**17  # 11 days and 3 years after 1970: of a clock that was not set, and of one that was
 DROPPED_SHARE_LIMIT = 0.01  # ours: a real bag loses 1 of 3300; with more, the stamps are not the times of the samples
+LATE_EVENT_NS = 100_000_000  # ours: nobody presses a pedal twice in that time
 DROPPED_GAP_NS = 50_000_000  # ours: a tip at 100 mm/s moves by 5 mm in it, one cell of the paper's grid
 
 
@@ -405,6 +406,37 @@ def recorded_signal(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
         return Signal(stamps_ns, values, topic)
     check_finite(topic, stamps_ns, values)
     return Signal(stamps_ns[kept], values[kept], topic, backward)
+
+
+def recorded_events(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
+    """Make a signal of events, such as the presses of a pedal: in order of time, without those recorded again later.
+
+    A recorder repeats the last message of such a topic at the start of each part of a bag, with its first stamp. Events
+    that were received out of order, by up to `LATE_EVENT_NS`, are put in the order of their stamps: none is lost.
+
+    Args:
+        stamps_ns: Integer nanoseconds, shape (T,), in the order of the recording.
+        values: The states after the events, shape (T,).
+        topic: The source.
+
+    Returns:
+        The signal, with the number of dropped messages in `backward_stamps`.
+
+    Raises:
+        BackwardStamps: A stamp goes back further, to one at which there was no such event.
+        NotFinite: A value is NaN or infinite.
+    """
+    if (stamps_ns[1:] > stamps_ns[:-1]).all():
+        return Signal(stamps_ns, values, topic)
+    seen, kept = set[tuple[int, float]](), list[bool]()
+    for event in zip(stamps_ns.tolist(), values.tolist(), strict=True):
+        kept.append(event not in seen)
+        seen.add(event)
+    stamps_ns, values = stamps_ns[kept], values[kept]
+    if (np.maximum.accumulate(stamps_ns) - stamps_ns <= LATE_EVENT_NS).all():
+        order = np.argsort(stamps_ns, kind="stable")
+        stamps_ns, values = stamps_ns[order], values[order]
+    return Signal(stamps_ns, values, topic, kept.count(False))
 
 
 def recorded_joints(arm: str, topic: str, stamps_ns: Ints, positions: Floats) -> Joints:

@@ -29,6 +29,7 @@ from skills.demonstration.motion import Joints as Joints
 from skills.demonstration.motion import Motion as Motion
 from skills.demonstration.motion import Signal as Signal
 from skills.demonstration.motion import equal_samples as equal_samples
+from skills.demonstration.motion import recorded_events as recorded_events
 from skills.demonstration.motion import recorded_joints as recorded_joints
 from skills.demonstration.motion import recorded_motion as recorded_motion
 from skills.demonstration.motion import recorded_signal as recorded_signal

@@ -9,7 +9,7 @@ dataset (see `lerobot`), or one JIGSAWS trial.
         *.json                     the tags of the recorders (see `tags`)
         *.mp4 and others           ignored
 
-The bag is in one folder, anywhere in the archive. A bag in several files is joined topic by topic, in order of time.
+The bag is in one folder, anywhere in the archive. The messages of a bag in several files are merged by their log time.
 If there is a `metadata.yaml`, it must name exactly these files and count exactly these messages.
 
 """
@@ -27,15 +27,14 @@ import yaml
 import zstandard
 
 from skills.demonstration.recording import Format, Recording, Topic
-from skills.errors import NoUsableTopic, UnknownFormat, UnreadableRecording
+from skills.errors import UnknownFormat, UnreadableRecording
 from skills.formats import jigsaws
 from skills.formats.archive import Archive, refusing, shown
-from skills.formats.join import in_time, join
 from skills.formats.lerobot import is_shadow, root_of
 from skills.formats.lerobot.episode import read_episode
 from skills.formats.mcap import NeedsRosbags, read_mcap
 from skills.formats.rosbag import Suffix, read_rosbag
-from skills.formats.tags import TAGS_BYTES, read_labels
+from skills.formats.tags import TAGS_BYTES, in_time, read_labels
 from skills.remedies import Action, Remedy
 
 FILES = 1000
@@ -71,7 +70,7 @@ def read_zip(file: BinaryIO, frame: str | None = None) -> Recording:
     Raises:
         UnknownFormat: It contains none of them.
         UnreadableRecording: The archive is damaged or dangerous, the bag incomplete, or a part of it unreadable.
-        NoUsableTopic: No topic of the bag, or of a part of it, has the pose of a PSM.
+        NoUsableTopic: No topic of the bag has the pose of a PSM.
         BadRecording: As for the files in it.
     """
     archive = Archive(file)
@@ -237,19 +236,20 @@ def _read_bag(archive: Archive, names: list[str], bag: list[str]) -> Recording:
 
 
 def _read_mcaps(archive: Archive, names: list[str]) -> Recording:
-    """Read the parts one after the other, so that only one at a time is unpacked."""
-    parts = []
+    """Read the parts one after the other, so that only one at a time is unpacked, unless rosbags needs them all."""
+    first, *others = names
+    with _plain(archive, first) as file:
+        try:
+            return read_mcap(file, others=_each(archive, others))
+        except NeedsRosbags:
+            with ExitStack() as files:
+                return read_rosbag([files.enter_context(_plain(archive, name)) for name in names], ".mcap")
+
+
+def _each(archive: Archive, names: Iterable[str]) -> Iterator[BinaryIO]:
     for name in names:
         with _plain(archive, name) as file:
-            try:
-                parts.append(read_one(file))
-            except NoUsableTopic as error:
-                if len(names) == 1:
-                    raise
-                raise NoUsableTopic(
-                    f"{shown(name)}, a part of the bag: {error.message}", *error.remedies, Remedy(Action.JOIN_BAG)
-                ) from error
-    return join(sorted(parts, key=lambda part: part.origin_ns))  # without metadata, names do not give the order
+            yield file
 
 
 @contextmanager

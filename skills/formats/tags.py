@@ -13,14 +13,13 @@ no time and are skipped; other JSON files are ignored.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import PurePosixPath
 from typing import Any
 
 from skills.demonstration.recording import Label
 from skills.errors import UnreadableRecording
 from skills.formats.archive import printable
-from skills.formats.join import in_time
 
 TAGS_BYTES = 32 << 20  # per JSON file: the frames of a day of video
 LABELS = 10_000
@@ -50,6 +49,11 @@ def read_labels(texts: Mapping[str, str]) -> tuple[Label, ...]:
         stamps = _stamps_for(name, document, frames)
         labels.update(label for stage in stages if (label := _label(name, stage, stamps)) is not None)
     return in_time(labels)
+
+
+def in_time(labels: Iterable[Label]) -> tuple[Label, ...]:
+    """Return labels in order of time, without duplicates."""
+    return tuple(sorted(set(labels), key=lambda label: (label.start_ns, label.end_ns, label.name)))
 
 
 def _parsed(name: str, text: str) -> Any:

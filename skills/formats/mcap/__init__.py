@@ -8,8 +8,9 @@ The file is read once, sequentially, and every checksum is verified; see `reader
     none      no checksum (0 means "not available" in MCAP; rosbags writes 0): a flipped bit would not be detected
 
 Messages are taken in order of their log time, as every MCAP reader does; samples have the stamp of their header. Few
-poses, joints and jaw angles with stamps that decrease in that order are dropped and counted; events such as pedals are
-not, because each one counts. Messages without a header have their log time as stamp.
+poses, joints and jaw angles with stamps that decrease in that order are dropped and counted; of events such as pedals,
+each of which counts, only repeated messages are. Messages without a header have their log time as stamp, and so have
+all of a topic whose headers have the stamp 0. The parts of a split recording are read as one file.
 
 A demonstration needs the motions, the jaws and the clutch: an error in one of them refuses the file. All other topics,
 setpoints among them, are optional: one that cannot be used is omitted, and `left_out` has the reason.
@@ -65,12 +66,16 @@ class NeedsRosbags(UnreadableRecording):
     """A valid file with message types that only rosbags can read; `numbers["integrity"]` is the file's integrity."""
 
 
-def read_mcap(file: BinaryIO, meaning: MeaningOf = topics.meaning) -> recording.Recording:
+def read_mcap(
+    file: BinaryIO, meaning: MeaningOf = topics.meaning, others: Iterable[BinaryIO] = ()
+) -> recording.Recording:
     """Read the used topics of a dVRK recording.
 
     Args:
         file: The MCAP file, at its beginning.
         meaning: Returns what a topic of a message type means; a topic without a meaning is not read.
+        others: The other parts of a recording that was split, in any order, each read before the next is taken. Their
+            messages are merged by log time.
 
     Returns:
         The recording, in millimetres.
@@ -82,7 +87,10 @@ def read_mcap(file: BinaryIO, meaning: MeaningOf = topics.meaning) -> recording.
         MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
     """
     try:
-        return _recording(_read_log(file, meaning))
+        log = _read_log(file, meaning)
+        for other in others:
+            log.merge(_read_log(other, meaning))
+        return _recording(log)
     except (SkillsError, MemoryError):
         raise
     except Exception as error:  # on a damaged file a parser may raise anything
@@ -120,6 +128,9 @@ class _Log:
     left_out: dict[str, str] = field(default_factory=dict)
     foreign: list[Channel] = field(default_factory=list)
     fields: dict[int, tuple[Field, ...]] = field(default_factory=dict)
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)  # of messages, by topic and type
+    notes: dict[str, str] = field(default_factory=dict)
+    integrities: set[recording.Integrity] = field(default_factory=set)
 
     def take(self, part: Part) -> None:
         """Decode the messages of a part whose topics are used, and store them."""
@@ -147,6 +158,28 @@ class _Log:
         self.left_out[topic.name] = str(error)
         topic.columns.clear()
         topic.channels.clear()
+
+    def merge(self, other: "_Log") -> None:
+        """Add the contents of another part of the same recording."""
+        for name, topic in other.topics.items():
+            mine = self.topics.setdefault(name, topic)
+            if mine is not topic:
+                mine.columns += topic.columns
+                mine.channels += topic.channels
+        self.left_out |= other.left_out
+        for name in self.left_out.keys() & self.topics.keys():
+            self.topics[name].columns.clear()
+            self.topics[name].channels.clear()
+        self.notes |= other.notes
+        self.counts += other.counts
+        self.integrities |= other.integrities
+
+    def close(self) -> None:
+        """Note what the whole file says, after its last part was taken."""
+        walker = self.walker
+        self.notes, self.integrities = dict(walker.notes), {walker.integrity}
+        for number, channel in walker.channels.items():
+            self.counts[channel.topic, self.type_of(channel)] += walker.counts[number]
 
     def type_of(self, channel: Channel) -> str:
         """Return the message type of a channel; "" for a channel without schema."""
@@ -178,6 +211,7 @@ def _read_log(file: BinaryIO, meaning: MeaningOf) -> _Log:
     log = _Log(Walker(file), meaning)
     for part in log.walker.parts():
         log.take(part)
+    log.close()
     if log.foreign:
         channel, integrity = log.foreign[0], log.walker.integrity
         schema = log.walker.schemas[channel.schema]
@@ -223,16 +257,14 @@ def _recording(log: _Log) -> recording.Recording:
     values = {kind: tuple(value for _, value in of_kind) for kind, of_kind in found.items()}
     signals = {kind: tuple(dict(of_kind).items()) for kind, of_kind in found.items()}  # the last one of each owner
     pedals = dict(signals[TopicKind.PEDAL])
-    counts: Counter[tuple[str, str]] = Counter()
-    for number, channel in log.walker.channels.items():
-        counts[channel.topic, log.type_of(channel)] += log.walker.counts[number]
+    (integrity, *others) = log.integrities
     return recording.Recording(
         format="mcap",
-        integrity=log.walker.integrity,
+        integrity="partial" if others else integrity,
         motions=values[TopicKind.MOTION],
         jaws=signals[TopicKind.JAW],
         clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
-        topics=topics.counted(counts),
+        topics=topics.counted(log.counts),
         joints=values[TopicKind.JOINTS],
         masters=values[TopicKind.MASTER],
         grippers=signals[TopicKind.GRIPPER],
@@ -240,7 +272,7 @@ def _recording(log: _Log) -> recording.Recording:
         following=signals[TopicKind.FOLLOWING],
         scales=signals[TopicKind.SCALE],
         tools=tuple(found[TopicKind.TOOL]),
-        notes=(*sorted(log.walker.notes.items()), *_reception(log)),
+        notes=(*sorted(log.notes.items()), *_reception(log)),
         left_out=tuple(sorted(log.left_out.items())),
         setpoints=values[TopicKind.SETPOINT],
         jaw_setpoints=signals[TopicKind.JAW_SETPOINT],
@@ -293,7 +325,7 @@ def _signal(topic: _Topic) -> recording.Signal:
         raise NoUsableTopic(
             f"{topic.name} has messages without a value; remove the topic from the recording.", topic=topic.name
         )
-    make = recording.recorded_signal if topic.meaning.kind in _ANGLES else recording.Signal
+    make = recording.recorded_signal if topic.meaning.kind in _ANGLES else recording.recorded_events
     return make(stamps_ns, values[:, 0], topic.name)
 
 
