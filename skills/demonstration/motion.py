@@ -192,7 +192,7 @@ class Motion:
     @property
     def is_local(self) -> bool:
         """Whether the poses are relative to the arm's own remote centre. The topic decides: frame names differ."""
-        return "/local/" in self.topic
+        return "/local/" in self.topic or self.topic.endswith("/position_cartesian_local_current")  # of dVRK 1.x
 
     @property
     def states_base(self) -> bool:

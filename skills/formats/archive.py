@@ -83,8 +83,8 @@ class Archive:
         """Return the claimed unpacked size of a member in bytes; the real one is never larger."""
         return self._infos[name].file_size
 
-    def text(self, name: str) -> str:
-        """Return a short member as text.
+    def text(self, name: str, errors: str = "strict") -> str:
+        """Return a short member as text; `errors` says what becomes of bytes that are not UTF-8.
 
         Raises:
             UnreadableRecording: Damaged, longer than `TEXT_BYTES`, or not UTF-8.
@@ -94,7 +94,7 @@ class Archive:
         with io.BytesIO() as out:
             self._copy(name, out)
             try:
-                return out.getvalue().decode("utf-8-sig")
+                return out.getvalue().decode("utf-8-sig", errors)
             except UnicodeDecodeError as error:
                 raise UnreadableRecording(f"{shown(name)} in the archive is not UTF-8 text.") from error
 

@@ -229,10 +229,16 @@ def _read_bag(archive: Archive, names: list[str], bag: list[str]) -> Recording:
             recording = read_rosbag(unpacked, suffix, logs=logs, counted=metadata is not None)
     if metadata is not None:
         check_counts(metadata, recording.topics)
-    labels = read_labels(dict(_tags(archive, names)))
+    labels, left_aside = read_labels(dict(_tags(archive, names)))
     kind: Format = "rosbag1" if suffix == ".bag" else "rosbag2"
     # "full", because a zip archive has a checksum (CRC-32) of every file in it
-    return replace(recording, format=kind, integrity="full", labels=in_time((*recording.labels, *labels)))
+    return replace(
+        recording,
+        format=kind,
+        integrity="full",
+        labels=in_time((*recording.labels, *labels)),
+        left_out=(*recording.left_out, *left_aside.items()),
+    )
 
 
 def _read_mcaps(archive: Archive, names: list[str]) -> Recording:
@@ -273,7 +279,7 @@ def _tags(archive: Archive, names: list[str]) -> Iterator[tuple[str, str]]:
     for name in names:
         if name.lower().endswith(".json") and archive.size(name) <= TAGS_BYTES and archive.size(name) <= left:
             left -= archive.size(name)
-            yield name, archive.text(name)
+            yield name, archive.text(name, errors="replace")
 
 
 def _read_trial(archive: Archive, names: list[str]) -> Recording:

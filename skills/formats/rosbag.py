@@ -212,7 +212,9 @@ def read_rosbag(
                 reader = opened.enter_context(_reading(paths))  # open files stay readable without their folder
             here = _convert(reader, out)
         out.seek(0)
-        return replace(read_mcap(out), format=_FORMATS[suffix], integrity=integrity, topics=here)
+        read = read_mcap(out)
+        left_out = tuple(sorted((dict(topics.not_understood(here)) | dict(read.left_out)).items()))
+        return replace(read, format=_FORMATS[suffix], integrity=integrity, topics=here, left_out=left_out)
 
 
 def _check_no_log_is_missing(paths: Sequence[Path]) -> None:

@@ -67,11 +67,12 @@ def ignore(_: int) -> None:
 
 @dataclass(frozen=True)
 class Bag:
-    """A bag on this machine: its files in order, its metadata.yaml and its stages."""
+    """A bag on this machine: its files in order, its metadata.yaml, its stages, and JSON beside it that is not read."""
 
     files: tuple[Path, ...]
     metadata: bag_folder.Metadata | None = None
     labels: tuple[Label, ...] = ()
+    left_aside: tuple[str, ...] = ()
 
     @property
     def size_bytes(self) -> int:
@@ -112,11 +113,8 @@ def find_bag(path: Path) -> Bag:
     known = bag_folder.read_metadata(metadata.read_text(errors="replace")) if metadata.is_file() else None
     names = {file.name: file for file in files}
     ordered = bag_folder.in_order(sorted(names, key=_by_number), known) if known else sorted(names, key=_by_number)
-    return Bag(
-        files=tuple(names[name] for name in ordered),
-        metadata=known,
-        labels=_labels_in(path),
-    )
+    labels, left_aside = _labels_in(path)
+    return Bag(tuple(names[name] for name in ordered), known, labels, tuple(left_aside))
 
 
 @contextmanager
@@ -210,23 +208,16 @@ def _plain_file(file: Path, folder: Path, *, counted: bool) -> Path:
     return plain
 
 
-def _labels_in(folder: Path) -> tuple[Label, ...]:
-    """Read the stages from the JSON files in a session's folder.
+def _labels_in(folder: Path) -> tuple[tuple[Label, ...], dict[str, str]]:
+    """Read the stages, and the files left aside, from the JSON files in a session's folder.
 
     A file over `TAGS_BYTES` has the frames of a long video, and is skipped.
     """
     texts = {}
     for file in sorted(folder.rglob("*.json")):
         if file.is_file() and file.stat().st_size <= TAGS_BYTES:
-            texts[file.relative_to(folder).as_posix()] = _text(file)
+            texts[file.relative_to(folder).as_posix()] = file.read_text(encoding="utf-8-sig", errors="replace")
     return read_labels(texts)
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise UnreadableRecording(f"{file.name} is not UTF-8 text; remove it from the folder.") from error
 
 
 def _stages(labels: Sequence[Label]) -> bytes:

@@ -258,13 +258,14 @@ def _recording(log: _Log) -> recording.Recording:
     signals = {kind: tuple(dict(of_kind).items()) for kind, of_kind in found.items()}  # the last one of each owner
     pedals = dict(signals[TopicKind.PEDAL])
     (integrity, *others) = log.integrities
+    listed = topics.counted(log.counts)
     return recording.Recording(
         format="mcap",
         integrity="partial" if others else integrity,
         motions=values[TopicKind.MOTION],
         jaws=signals[TopicKind.JAW],
         clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
-        topics=topics.counted(log.counts),
+        topics=listed,
         joints=values[TopicKind.JOINTS],
         masters=values[TopicKind.MASTER],
         grippers=signals[TopicKind.GRIPPER],
@@ -273,7 +274,7 @@ def _recording(log: _Log) -> recording.Recording:
         scales=signals[TopicKind.SCALE],
         tools=tuple(found[TopicKind.TOOL]),
         notes=(*sorted(log.notes.items()), *_reception(log)),
-        left_out=tuple(sorted(log.left_out.items())),
+        left_out=tuple(sorted((dict(topics.not_understood(listed)) | log.left_out).items())),
         setpoints=values[TopicKind.SETPOINT],
         jaw_setpoints=signals[TopicKind.JAW_SETPOINT],
     )
