@@ -33,6 +33,7 @@ from skills.formats.archive import Archive, refusing, shown
 from skills.formats.lerobot import is_shadow, root_of
 from skills.formats.lerobot.episode import read_episode
 from skills.formats.mcap import NeedsRosbags, read_mcap
+from skills.formats.mcap.cdr import UNPACK
 from skills.formats.rosbag import Suffix, read_rosbag
 from skills.formats.tags import TAGS_BYTES, in_time, read_labels
 from skills.remedies import Action, Remedy
@@ -113,10 +114,13 @@ def read_metadata(text: str) -> Metadata:
             counts[name] += int(messages[:18])  # as many digits as 64 bits hold
         if not files:
             raise ValueError("no files")
+        mode = bag.get("compression_mode", "")
     except (yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError) as error:
         raise UnreadableRecording(
             f"{METADATA} is not the metadata of a bag. Remove it, or write it with `ros2 bag reindex`."
         ) from error
+    if str(mode).upper() == "MESSAGE":
+        raise UnreadableRecording(f"The messages of the bag are compressed one by one (compression_mode). {UNPACK}")
     return Metadata(files, dict(counts))
 
 

@@ -139,6 +139,7 @@ def _allowed(action: int, one: str | None, other: str | None, _schema: str | Non
 
 
 ROS1_MAGIC = b"#ROSBAG V"
+HEADER_BYTES = 4096  # of a bag of ROS 1: its first record
 DB3_MAGIC = b"SQLite format 3\0"
 
 Suffix = Literal[".bag", ".db3", ".mcap"]
@@ -308,8 +309,25 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
 def _reading(paths: Sequence[Path]) -> Iterator[AnyReader]:
     advice = "Copy it again, or convert it with `ros2 bag convert` or `rosbags-convert`."
     what = f"The {_NAMES.get(paths[0].suffix, 'bag')}"
+    for path in paths:
+        with path.open("rb") as file:
+            _check_indexed(file.read(HEADER_BYTES))
     with refusing(what, advice), AnyReader(paths, default_typestore=_ROS2) as reader:
         yield reader
+
+
+def _check_indexed(head: bytes) -> None:
+    """Refuse a bag of ROS 1 whose header has no place of an index, as while it is recorded (Bag format 2.0).
+
+    Raises:
+        UnreadableRecording: It was not closed.
+    """
+    at = head.find(b"index_pos=") if head.startswith(ROS1_MAGIC) else -1
+    if at >= 0 and head[at + 10 : at + 18] == bytes(8):
+        raise UnreadableRecording(
+            "The ROS 1 bag has no index: its recorder was ended before it closed the bag (a .bag.active). Index it "
+            "with `rosbag reindex FILE`, and send the result."
+        )
 
 
 def _convert(reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:

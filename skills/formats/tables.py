@@ -88,6 +88,7 @@ KNOWN = (
     "t_s (or t_ms, t_us, t_ns), x_m, y_m, z_m (or _mm), qx, qy, qz, qw, roll_rad, pitch_rad, yaw_rad, rx_rad, ry_rad, "
     "rz_rad, jaw_rad (or _deg), clutch, q1_rad, q2_rad, q3_m, q4_rad, q5_rad, q6_rad"
 )
+_INDICES = ("", "Unnamed: 0", "index")  # the first column of a table by pandas: the numbers of its rows
 _PAPER_NAMES = {
     "Rot R": "roll_rad",
     "Rot P": "pitch_rad",
@@ -257,7 +258,8 @@ def _uses(names: list[str], options: ReadingOptions) -> dict[str, _Use]:
             continue
         quantity, unit = _named(aliases.get(name, name))
         if not quantity or (not unit and QUANTITIES[quantity] is not PLAIN):
-            if not mapped and not (of_calibration and _OTHERS_OF_CALIBRATIONS.fullmatch(name)):
+            is_index = index == 0 and name in _INDICES  # it is listed as not used
+            if not mapped and not is_index and not (of_calibration and _OTHERS_OF_CALIBRATIONS.fullmatch(name)):
                 unknown.append(name)
         elif quantity in own:
             one, other = _full(quantity, own[quantity].unit), _full(quantity, unit)

@@ -29,7 +29,7 @@ from mcap.writer import Writer
 from skills.demonstration.recording import Label, Topic
 from skills.errors import BadInput, SkillsError, UnreadableRecording
 from skills.formats import bag_folder, rosbag
-from skills.formats.archive import pack
+from skills.formats.archive import HEAD_BYTES, check_pointer, pack
 from skills.formats.checksums import digest_of
 from skills.formats.jigsaws import trials
 from skills.formats.lerobot import INFO
@@ -190,6 +190,8 @@ def _plain_file(file: Path, folder: Path, *, counted: bool) -> Path:
     counted.
     """
     suffix = file.suffix.lower()
+    with file.open("rb") as content:
+        check_pointer(content.read(HEAD_BYTES))
     if suffix != ".zstd":
         logs = [log for log in (Path(f"{file}{beside}") for beside in bag_folder.LOGS) if log.is_file()]
         with file.open("rb") as content:

@@ -183,7 +183,6 @@ def test_the_callers_file_stays_open():
         b"<!DOCTYPE html><html>, </html>",
         b'{"t_s": [0], "x_m": [1]}',
         b'[{"t_s": 0}, 1]',
-        b"\xff\xfet\0_\0s\0,\0",
         b"0.1 0.2 0.3\n0.1 0.2 0.3\n",
         bytes(100),
         b"PK\x05\x06" + bytes(18),

@@ -249,8 +249,8 @@ def _feature(name: str, described: Any) -> Feature:
         if dtype in ("image", "video"):
             return Feature(name, dtype, 1)
         width = prod(int(side) for side in shape)
-        # Some datasets have a list of one list of names, others one list under a word such as "motors".
-        names = next(iter(names.values())) if isinstance(names, dict) and len(names) == 1 else names
+        names = _listed(names) if isinstance(names, dict) else names
+        # some datasets have a list of one list of names
         names = names[0] if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list) else names
         flat = tuple(names) if isinstance(names, list) else ()
         if not 1 <= width <= NUMBERS or not all(isinstance(one, str) for one in flat) or len(flat) not in (0, width):
@@ -261,6 +261,15 @@ def _feature(name: str, described: Any) -> Feature:
             "many names as numbers."
         ) from error
     return Feature(name, dtype, width, flat)
+
+
+def _listed(names: Json) -> Any:
+    """Return names under words such as "motors", group after group; or those that have their indices as values."""
+    if all(isinstance(one, list) for one in names.values()):
+        return [name for group in names.values() for name in group]
+    if sorted(names.values()) == list(range(len(names))):
+        return sorted(names, key=names.__getitem__)
+    return next(iter(names.values())) if len(names) == 1 else names
 
 
 def _tasks_in(file: BinaryIO) -> dict[int, str]:

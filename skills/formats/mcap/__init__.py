@@ -232,6 +232,12 @@ def _text(schema: MessageSchema) -> str:
 
 
 def _check_encoding(channel: Channel, schema: MessageSchema) -> None:
+    if channel.encoding == "ros1":
+        raise UnreadableRecording(
+            f"The MCAP file has the messages of a ROS 1 bag ({channel.topic}), which are not read from MCAP. Send the "
+            ".bag from which it was converted.",
+            topic=channel.topic,
+        )
     if (channel.encoding, schema.encoding) != ("cdr", "ros2msg"):
         raise UnreadableRecording(
             f"{channel.topic} is encoded as {channel.encoding!r} with a {schema.encoding!r} schema; only 'cdr' "
