@@ -117,7 +117,14 @@ def certify_tube(path: PosePath, limits: TubeLimits, update: Update = advance) -
 
     Returns:
         The certificate, with the premises that do not hold.
+
+    Raises:
+        BadSettings: The window is not shorter than the path.
     """
+    if limits.ahead >= len(path.tip_mm):
+        raise BadSettings(
+            "The window of a tube must be shorter than its path.", ahead=limits.ahead, phases=len(path.tip_mm)
+        )
     moves = [_moves(path, ahead) for ahead in range(1, limits.ahead + 1)]
     move_mm, move_rad = (float(max(move[k] for move in moves)) for k in (0, 1))
     faults = []
