@@ -16,6 +16,8 @@ from skills.learning.certificate import (
 )
 from skills.learning.dynamic_programming import FAINT
 from skills.learning.policy import Policy
+from skills.learning.pose_step import near_share
+from skills.learning.tube import CertifiedPoses
 from skills.planning.plan import DrivenPass, driven_pass
 from skills.schemas.policies import GateRefusal, RefusalKind
 from skills.settings import Settings
@@ -125,6 +127,19 @@ def _not_the_style(policy: Policy, certificate: Certificate, near: NearStarts) -
             f"{near.share:.0%} of the demonstration, and the gate requires {near.least_share:.0%}; train with a "
             f"joining rule such as --join {max(near.least_share, 0.5):g}, which leads them back to an earlier part",
         )
+
+
+def pose_refusals(poses: CertifiedPoses | None, near: NearLimits) -> list[GateRefusal]:
+    """Return the reason why the pose style of a version is against its release, if it is; NaN fails."""
+    share = 1.0 if poses is None else near_share(poses.path, poses.tube.limits, near.radius_mm)
+    if share >= near.least_share:
+        return []
+    text = (
+        f"of the starts within {near.radius_mm:g} mm of the pose style's first pose, one joins it where {share:.0%} is "
+        f"left, and the gate requires {near.least_share:.0%}; train phase-q-learning or value-iteration with a joining "
+        f"rule such as --join {max(near.least_share, 0.5):g}"
+    )
+    return [GateRefusal("near starts", text)]
 
 
 def driven_or_refused(policy: Policy, demo: Demo) -> tuple[DrivenPass | None, list[GateRefusal]]:
