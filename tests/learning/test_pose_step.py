@@ -71,7 +71,7 @@ def test_no_start_near_the_first_pose_follows_less_than_is_stated(radius_mm, bes
     assert min(follows) >= stated - 0.07  # a lattice of a sixth of the radius, and one tick
 
 
-def test_the_gate_refuses_a_pose_style_that_is_joined_at_its_end_and_not_by_a_rule():
+def test_the_gate_refuses_a_pose_style_that_is_joined_at_its_end():
     path = coming_back()
     for limits, refused in ((TubeLimits(), True), (TubeLimits(join_share=0.5), False)):
         reasons = pose_refusals(CertifiedPoses("PSM2", "PSM2_base", path, certify_tube(path, limits)), NEAR)

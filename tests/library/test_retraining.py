@@ -116,6 +116,29 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
     assert (style.stale, style.demonstration_row) == (["a newer demonstration"], older.demonstration_row)
 
 
+@pytest.mark.parametrize("release", [False, True])
+def test_stale_styles_are_settled_by_a_batch_that_makes_an_older_version_again(database: Database, release: bool):
+    def stale(**asked: object) -> list[list[str]]:
+        return [
+            style.stale for style in styles_of(database, retrain(database, only_stale=True, release=release, **asked))
+        ]
+
+    add_styles(database, 3)
+    stale()
+    retrain(database, learner=ValueIteration(), release=release)
+    assert stale(surgeon="surgeon-0") == [["other settings"]] * 3
+    assert stale() == []
+    assert count_versions(database) == 6
+    again = ask_retraining(database, only_stale=True, release=release)
+    assert (again.state, again.request["styles"]) == ("succeeded", 0)
+    if release:  # somebody releases the other version of one of them: what the batch made is not served any more
+        with database.reading() as session:
+            other = session.scalars(select(PolicyVersion).where(PolicyVersion.version == 2)).first()
+        cases.release(database, other)
+        assert stale() == [["other settings"]]
+        assert stale() == []
+
+
 # ---- cancelling and erasing
 
 
