@@ -73,6 +73,7 @@ OPTIONS = {
     "suture_points": "point",
     "start_mm": "start",
     "demos": "demo",
+    "without_surgeons": "without-surgeon",
     "surgeons": "surgeon",
     "sutures": "suture",
     "arms": "arm",

@@ -21,7 +21,7 @@ from skills.library.policies.batches import compare
 from skills.library.policies.learning import learn_style
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
-from skills.schemas.training import FitOnTheSame, PolicyFigures
+from skills.schemas.training import FitOnTheSame, PolicyFigures, TrainingIn
 from tests.library import cases
 from tests.library.styles import (
     NO_CONSENT,
@@ -137,6 +137,11 @@ def test_stale_styles_are_settled_by_a_batch_that_makes_an_older_version_again(d
         cases.release(database, other)
         assert stale() == [["other settings"]]
         assert stale() == []
+
+
+def test_no_demonstration_is_not_the_newest_one():
+    with pytest.raises(ValueError, match="demos"):
+        TrainingIn(surgeon="kestrel", suture=cases.SUTURE, demos=[])
 
 
 # ---- cancelling and erasing

@@ -33,8 +33,8 @@ _REMEDIES: dict[RefusalKind, str] = {
     "faint": "Train it with a gamma nearer to 1, or lay the demonstration on larger cells.",
     "not optimal": _OTHERWISE,
     "unreached": _OTHERWISE,
-    "scene odds": "Train it with value-iteration or a smaller slip, or record the hand-off further from the scene; the "
-    "limits are SKILLS_SCENE_LEAST_FINISHING and SKILLS_SCENE_MOST_TOUCHING.",
+    "scene odds": "Train it with a smaller slip (by value-iteration, if another learner made it), or record the "
+    "hand-off further from the scene; the limits are SKILLS_SCENE_LEAST_FINISHING and SKILLS_SCENE_MOST_TOUCHING.",
     "frame": "Record the arm's local/measured_cp, which is in its base, or its measured_js.",
     "joint limits": "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere.",
     "jaw held": "Train it again, and request its release.",
