@@ -18,6 +18,11 @@ Separators may be dots, as in `observation.cartesian_state.psm1.pose.position.x`
 one, with the instrument whose number is in the dataset's tool name (`observation.meta.tool.psm1`), or in `tools` of our
 own file. Motions are called by the topics of a dVRK from which recorders take such columns.
 
+The exporter of jhu-dvrk/data_collection calls a feature after its topic and a number after its place in the message, as
+in `ros.PSM1.local.measured_cp` with `pose.position.x`; or, by its template, the joints and the jaw of one arm `joint_0`
+to `joint_5` and `jaw`, without the arm, which is then that of `tools`. Its clock is `timestamp_ns`; its `fps` are
+nominal.
+
 Of actions only those are used whose names say that they are setpoints, with `_sp` or `_setpoint`: under the names of
 the state an action may as well be the next state, or a difference. Setpoints that are not usable are left out.
 """
@@ -63,11 +68,20 @@ _JOINT = re.compile(
     re.I,
 )
 _JAW = re.compile(r"(?:observation\.state\.)?(psm\d{1,2})[._](?:jaw|gripper)(_sp|_setpoint)?", re.I)
+_ROS = r"ros\.(?:(?!SUJ\.)\w+\.)*?(psm\d{1,2})\."
+_ROS_POSE = re.compile(
+    _ROS + r"(local\.)?(measured_cp|setpoint_cp)\.(?:pose|transform)"
+    r"\.(?:(?:position|translation)\.([xyz])|(?:orientation|rotation)\.([xyzw]))",
+    re.I,
+)
+_ROS_ANGLE = re.compile(_ROS + r"(jaw\.)?(measured_js|setpoint_js)\.position\.([0-5])", re.I)
+_BARE_JOINTS, _BARE_JAW = tuple(f"joint_{k}" for k in range(6)), "jaw"
 _TOOL = re.compile(r"(?:observation\.meta\.tool\.)?(psm\d{1,2})(?:_tool_type)?", re.I)
 _NUMBER = re.compile(r"(?:^|:)(\d+)(?:\[|$)")  # of "LARGE_NEEDLE_DRIVER:400006[..11]", or alone
 _JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 _SCALARS = ("timestamp", "frame_index", "episode_index", "task_index")
-_SEC, _NANOSEC = "observation.meta.ros_time_sec", "observation.meta.ros_time_nsec"
+_CLOCKS = "observation.meta.ros_time_sec", "observation.meta.ros_time_nsec", "timestamp_ns"
+_SEC, _NANOSEC, _STAMP = _CLOCKS
 
 Place = tuple[str, int]  # a feature, and the index of one of its numbers
 LeftOut = tuple[str, str]  # a topic or a feature, and why it is not used
@@ -109,6 +123,9 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
     _check_rate(dataset, table, stamps_ns, clock)
     stamps_ns.setflags(write=False)  # so that all streams share it
     values = _values(table, meanings)
+    for arm, kind in [one for one, parts in values.items() if one[1] == "jaw" and np.isnan(parts[0]).all()]:
+        del values[arm, kind]
+        unknown.append((columns.topic_of(arm, kind), "All its numbers are NaN: it was not recorded."))
     tools = _tools(dataset, table)
     joints = {
         arm: Joints(arm, columns.topic_of(arm, kind), stamps_ns, one[0])
@@ -141,7 +158,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
 
 def _read(dataset: Dataset, meanings: Mapping[columns.Quantity, Mapping[int, Place]]) -> ParquetTable:
     """Read the columns of some quantities, the scalars and the tools."""
-    used = {feature for places in meanings.values() for feature, _ in places.values()} | {*_SCALARS, _SEC, _NANOSEC}
+    used = {feature for places in meanings.values() for feature, _ in places.values()} | {*_SCALARS, *_CLOCKS}
     features = [one for one in dataset.features if (one.name in used and not one.is_text) or _arms_of_tools(one)]
     with dataset.files.unpacked(dataset.data[0]) as file:
         return read_columns(file, [one.column for one in features])
@@ -217,13 +234,14 @@ def _meanings(
     unknown, faults = [], {}
     for feature in numeric:
         action = feature.name == "action" or feature.name.startswith("action.")
-        if not (action or feature.name.startswith("observation.")) or feature.name in (_SEC, _NANOSEC):
+        if not (action or feature.name.startswith(("observation.", "ros."))) or feature.name in (_SEC, _NANOSEC):
             continue
+        bare = _bare(dataset, feature)
         nameless = []
         for index in range(feature.width):
             place, names = (feature.name, index), feature.called(index)
             said = (meaning_of(name.removeprefix("action.") if action else name) for name in names)
-            meaning = next((one for one in said if one is not None), None)
+            meaning = bare.get(index) or next((one for one in said if one is not None), None)
             if meaning is None or (action and meaning[1] not in columns.SETPOINTS):
                 nameless += [] if place in taken else [names[0]]
             elif meaning not in stated and place not in taken:
@@ -261,7 +279,26 @@ def meaning_of(name: str) -> tuple[str, str, int] | None:
         return joint[1].upper(), kind, int(which) - 1 if which.isdecimal() else _JOINT_NAMES.index(which)
     if jaw := _JAW.fullmatch(name):
         return jaw[1].upper(), "jaw_setpoint" if jaw[2] else "jaw", 0
+    if pose := _ROS_POSE.fullmatch(name):
+        kind = ("local_" if pose[2] else "") + ("pose" if pose[3].lower() == "measured_cp" else "setpoint")
+        part = f"position.{pose[4]}" if pose[4] else f"orientation.{pose[5]}"
+        return pose[1].upper(), kind, columns.POSE_PARTS.index(part.lower())
+    if angle := _ROS_ANGLE.fullmatch(name):
+        is_measured = angle[3].lower() == "measured_js"
+        if angle[2]:
+            return (angle[1].upper(), "jaw" if is_measured else "jaw_setpoint", 0) if angle[4] == "0" else None
+        return angle[1].upper(), "joints" if is_measured else "joint_setpoints", int(angle[4])
     return None
+
+
+def _bare(dataset: Dataset, feature: Feature) -> dict[int, tuple[str, str, int]]:
+    """Return the meanings of a state's numbers that are called after joints and no arm."""
+    if feature.name != "observation.state" or feature.names[:6] != _BARE_JOINTS:
+        return {}
+    arms = list(dataset.statements.tools)
+    arm = arms[0] if len(arms) == 1 else "PSM"
+    jaw = {6: (arm, "jaw", 0)} if feature.names[6:7] == (_BARE_JAW,) else {}
+    return {k: (arm, "joints", k) for k in range(6)} | jaw
 
 
 def _stated(dataset: Dataset, numeric: Sequence[Feature]) -> dict[tuple[str, str, int], Place]:
@@ -428,11 +465,13 @@ def _stamps_ns(dataset: Dataset, table: ParquetTable) -> tuple[Ints, str]:
         NotFinite: A timestamp is NaN or infinite.
         UnreadableRecording: A number is not that of a frame or of a clock.
     """
-    sec, nanosec = table.column(_SEC), table.column(_NANOSEC)
+    sec, nanosec, whole_ns = table.column(_SEC), table.column(_NANOSEC), table.column(_STAMP)
     if sec is not None and nanosec is not None:
         if not ((np.abs(sec) < 2**33) & (np.rint(sec) == sec) & (nanosec >= 0) & (nanosec < 1e9)).all():
             raise UnreadableRecording(f"{_SEC} and {_NANOSEC} are not whole seconds and nanoseconds of a clock.")
         return sec.astype(np.int64) * 1_000_000_000 + np.rint(nanosec).astype(np.int64), CLOCK
+    if whole_ns is not None and ((whole_ns >= 0) & (whole_ns < 2**62)).all():
+        return whole_ns.astype(np.int64), CLOCK
     frames, seconds = table.column("frame_index"), table.column("timestamp")
     frames = np.arange(table.rows, dtype=np.float64) if frames is None else frames
     if not ((frames >= 0) & (frames < 2**40)).all():
