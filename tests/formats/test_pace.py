@@ -57,7 +57,7 @@ def in_ns(seconds):
 
 
 @pytest.mark.parametrize(("name", "scale", "right"), [("t_ms", 1, "s"), ("t_s", 1e3, "ms"), ("t_us", 1e3, "ms")])
-def test_times_in_another_unit_than_their_name_are_asked_about_with_the_one_that_fits(name, scale, right):
+def test_times_in_another_unit_are_asked_about_with_the_one_that_fits(name, scale, right):
     with pytest.raises(errors.ImplausibleMotion, match=rf"{name}.*In {right} they would give 100 poses per second"):
         read(table(*stroke(), time=name, scale=scale))
     assert read(table(*stroke(), time=name, scale=scale), column=[f"t_{right}={name}"]).duration_s == pytest.approx(
