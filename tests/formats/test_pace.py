@@ -224,7 +224,7 @@ def test_a_restarted_node_is_no_second_source():
 
 
 def test_a_single_pose_is_refused_in_words_where_it_is_cut():
-    with pytest.raises(errors.BadSegment, match="single pose"):
+    with pytest.raises(errors.BadSegment, match="one sample"):
         cut_demo(read("t_s,x_mm,y_mm,z_mm\n0,1,50,-120\n"))
 
 
