@@ -392,9 +392,8 @@ def recorded_signal(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
         NotFinite: A value is NaN or infinite.
         NotMetres: An angle is beyond `JAW_RAD`.
     """
-    wide = np.abs(values) > JAW_RAD
-    if wide.any() and np.isfinite(values).all():  # those that are not are refused below
-        first = int(np.argmax(wide))
+    if len(values) and max(values.max(), -values.min()) > JAW_RAD and np.isfinite(values).all():
+        first = int(np.argmax(np.abs(values) > JAW_RAD))
         raise NotMetres(
             f"{topic}: a jaw's angle of {values[first]:g} rad {_at(stamps_ns, first)}; a jaw opens by less than "
             f"{JAW_RAD:.4g} rad. Is it in degrees? Give radians, or name the unit of the column, as in jaw_deg."

@@ -1,6 +1,6 @@
 """Whether times and positions of a motion are possible for a PSM, or in another unit than they were read in.
 
-    seconds (T,), tip_mm (T, 3) --pace_of--> MotionPace: samples per second, and the speed of the tip
+    stamps_ns (T,), tip_mm (T, 3) --pace_of--> MotionPace: samples per second, and the speed of the tip
 
 The *pace* speed is that of the path, not of the time: half of the path is travelled faster, so rests do not count, and
 neither do a few samples with a late stamp. In all hand-offs and trials that we have it is 9 to 90 mm/s. It is
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skills.arrays import Floats
+from skills.arrays import Floats, Ints
 from skills.errors import ImplausibleMotion
 
 TIP_MM_S = 1000.0
@@ -22,8 +22,8 @@ LEAST_HZ = 5.0  # a tip at 100 mm/s moves by 20 mm between two samples
 MOST_HZ = 100_000.0
 USUAL_MM_S = (7.0, 120.0)
 USUAL_HZ = 250.0  # of columns that record a motion above USUAL_MM_S: pictures have at most 60 Hz, the dVRK has 100
-WINDOW_S = 0.05
-WINDOWS = 2000  # evenly spaced, however long the recording is
+WINDOW_NS, FURTHEST_NS = 50_000_000, 10**18
+WINDOWS = 1000  # evenly spaced, however long the recording is
 
 
 class MotionPace(NamedTuple):
@@ -44,21 +44,28 @@ class MotionPace(NamedTuple):
         return f"{rate} poses per second, and half of the path at more than {speed} mm/s"
 
 
-def pace_of(seconds: Floats, tip_mm: Floats) -> MotionPace:
-    """Measure the pace of a motion in windows of `WINDOW_S`.
+def pace_of(stamps_ns: Ints, tip_mm: Floats, factor: float = 1.0) -> MotionPace:
+    """Measure the pace of a motion in windows of `WINDOW_NS`.
 
     Args:
-        seconds: Times from any near origin, shape (T,), strictly increasing, T at least 2.
+        stamps_ns: Integer nanoseconds, shape (T,), strictly increasing, T at least 2.
         tip_mm: Positions, shape (T, 3).
+        factor: By which the times are multiplied.
     """
-    first = np.unique(np.linspace(0, len(seconds) - 2, WINDOWS).astype(np.int64))
-    last = np.searchsorted(seconds, seconds[first] + WINDOW_S).clip(first + 1, len(seconds) - 1)
-    way_mm = np.linalg.norm(tip_mm[last] - tip_mm[first], axis=1)
-    speed = way_mm / (seconds[last] - seconds[first])
+    first = np.arange(0, len(stamps_ns) - 1, 1 + len(stamps_ns) // WINDOWS)
+    after_ns = stamps_ns[first] + min(round(WINDOW_NS / factor), FURTHEST_NS)
+    last = np.searchsorted(stamps_ns, after_ns).clip(first + 1, len(stamps_ns) - 1)
+    moved = tip_mm[last] - tip_mm[first]
+    way_mm = np.sqrt(np.einsum("ij,ij->i", moved, moved))
+    lasted_s = (stamps_ns[last] - stamps_ns[first]) * (factor / 1e9)
+    speed = way_mm / lasted_s
     order = np.argsort(speed)
-    travelled = np.cumsum(way_mm[order])
+    travelled = np.cumsum(
+        np.minimum(way_mm, TIP_MM_S * lasted_s + LATE_MM)[order]
+    )  # so that no jump outweighs the rest
     middle = order[np.searchsorted(travelled, travelled[-1] / 2)]
-    return MotionPace(1.0 / float(np.median(seconds[first + 1] - seconds[first])), float(speed[middle]))
+    step_ns = float(np.median(stamps_ns[first + 1] - stamps_ns[first]))
+    return MotionPace(1e9 / (factor * step_ns), float(speed[middle]))
 
 
 def check_steps(topic: str, stamps_s: Floats, tip_mm: Floats) -> None:

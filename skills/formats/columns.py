@@ -109,8 +109,9 @@ def check_joints(topic: str, joints: Floats) -> None:
         NotMetres: An insertion beyond 1 m, or an angle beyond `_JOINT_RAD`.
     """
     limits = np.where(np.array(UNITS) == "mm", COORDINATE_LIMIT_MM, _JOINT_RAD)
-    wrong = np.abs(joints[:, : len(limits)]) > limits[: joints.shape[1]]  # a jaw may follow them
-    if wrong.any():
+    six, limits = joints[:, : len(limits)], limits[: joints.shape[1]]  # a jaw may follow them
+    if len(six) and (np.maximum(six.max(axis=0), -six.min(axis=0)) > limits).any():
+        wrong = np.abs(six) > limits
         row, joint = np.argwhere(wrong)[0].tolist()
         raise NotMetres(
             f"{topic}: {JOINTS[joint]} is {joints[row, joint]:g} {UNITS[joint]} in sample {row}; no joint of a PSM is. "

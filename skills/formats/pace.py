@@ -61,9 +61,10 @@ def _unusual(recording: Recording, pace: MotionPace) -> str | None:
     least, most = USUAL_MM_S
     if pace.rate_hz > USUAL_HZ and pace.speed_mm_s > most:
         return f"recorders of more than {USUAL_HZ:g} poses per second see hand-offs at 10 to 90 mm/s"
+    if recording.format != "csv" or pace.speed_mm_s >= least:
+        return None
     wide = any(np.ptp(motion.tip_mm, axis=0).max() > SMALL_MM for motion in recording.motions)
-    slow = wide and pace.speed_mm_s < least and recording.format == "csv"
-    return f"a hand-off is faster than {least:g} mm/s" if slow else None
+    return f"a hand-off is faster than {least:g} mm/s" if wide else None
 
 
 def _time_of(recording: Recording) -> Column | None:
@@ -72,7 +73,7 @@ def _time_of(recording: Recording) -> Column | None:
 
 def _pace(motions: Sequence[Motion], factor: float = 1.0) -> MotionPace:
     """Return the pace of the motions with the highest, if their times were multiplied by a factor."""
-    paces = [pace_of((one.stamps_ns - one.stamps_ns[0]) * (factor / 1e9), one.tip_mm) for one in motions]
+    paces = [pace_of(one.stamps_ns, one.tip_mm, factor) for one in motions]
     return MotionPace(max(one.rate_hz for one in paces), max(one.speed_mm_s for one in paces))
 
 

@@ -157,7 +157,7 @@ def test_tremor_lost_seconds_late_stamps_and_a_fast_arm_are_not_refused():
 def test_the_pace_is_that_of_the_path_whatever_its_rests():
     seconds, tip = stroke(700)
     rested = np.concatenate([np.repeat(tip[:1], 5000, axis=0), tip])
-    one, other = pace_of(seconds, tip), pace_of(np.arange(len(rested)) / 100, rested)
+    one, other = pace_of(in_ns(seconds), tip), pace_of(in_ns(np.arange(len(rested)) / 100), rested)
     assert (one.rate_hz, other.rate_hz) == (pytest.approx(100), pytest.approx(100))
     assert other.speed_mm_s == pytest.approx(one.speed_mm_s, rel=0.1)
     assert 20 < one.speed_mm_s < TIP_MM_S
