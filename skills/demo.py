@@ -247,9 +247,9 @@ def real_recording(client: Client) -> None:
 def verdict(playback: Playback) -> str:
     """Return a playback's verdict in words."""
     line = playback.headline
-    if not playback.feasible or line is None:
-        return str(playback.report.failure_sentence)
-    return f"feasible; {line.estimate or 'not judged'}"
+    if not playback.feasible or line is None or line.probability is None:
+        return "feasible, not judged" if playback.feasible else str(playback.report.failure_sentence)
+    return f"feasible; {line.event} in {line.probability.count} of {line.probability.of} worlds"
 
 
 if __name__ == "__main__":
