@@ -375,3 +375,16 @@ def test_opening_a_file_once_more_gives_up_no_lock_on_it(tmp_path: Path, another
         with one.writing() as session:
             session.add(Executor(id="second"))
         assert count_elsewhere() == "2"
+
+
+def test_a_file_without_write_permission_is_said_so_in_words(tmp_path: Path):
+    url = backends.fresh("sqlite", tmp_path)
+    with closing(Database(url)) as database:
+        event.listen(database.engine, "connect", lambda connection, _: connection.execute("PRAGMA query_only = ON"))
+        for change in (database.writing, lambda: database.writing(())):
+            with pytest.raises(DatabaseUnusable, match="cannot be written to"), change():
+                pass
+        with pytest.raises(DatabaseUnusable, match="cannot be written to"):
+            database.migrate()
+        with database.reading() as session:
+            assert session.get(Executor, "first") is None

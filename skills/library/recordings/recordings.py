@@ -397,11 +397,12 @@ def stored_recording(
                 if intact:
                     deque(recording_bytes(session, stored), maxlen=0)
                 return cached
+            damaged = is_cached(session, stored)
             file.writelines(recording_bytes(session, stored))
         parsed = parse(file, **stored.reading.options)
     entry = entry_of(stored, parsed)
     if entry is not None:
-        cache_content(database, stored, entry)
+        cache_content(database, stored, entry, damaged=damaged)
     return parsed
 
 
