@@ -18,7 +18,7 @@ from time import monotonic
 from typing import Any, cast
 
 from sqlalchemy import Select, Table, delete, exists, or_, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from skills.db import models, now
 from skills.db.models import (
@@ -42,7 +42,7 @@ JOBS_AT_ONCE = 300
 FEWEST_JOBS = 20
 HELD_S = 0.05  # ours: half of the time for which nothing may hold SQLite's one lock
 PICTURES_AT_ONCE = 10
-UNDIVIDED_S = 600.0  # ours: the styles of a batch are added within seconds, or its request was interrupted
+UNDIVIDED_S = 60.0  # ours: some styles of a batch are added each second, or its request was interrupted
 STEADY_S = 3600.0  # ours: retentions are of a year, so an hour more changes nothing
 STEP_S = 60.0  # ours: a larger difference is no correction of a clock that was right
 _JOBS = cast(Table, Job.__table__)  # bare: who erases need not be allowed to see all that is left
@@ -190,7 +190,9 @@ def _jobs_of(surgeon_row: int) -> Select[int]:
 def _fail_undivided(database: Database) -> None:
     """Fail the batches to which nobody adds styles any more."""
     long_ago = now() - timedelta(seconds=UNDIVIDED_S)
-    waiting = (Job.kind == BATCH, Job.state.in_(ACTIVE), Job.submitted_at.is_(None), Job.created_at < long_ago)
+    part, of = aliased(Job), StyleToRetrain
+    lately = exists().where(of.job_row == Job.row, of.part_row == part.row, part.created_at >= long_ago)
+    waiting = (Job.kind == BATCH, Job.state.in_(ACTIVE), Job.submitted_at.is_(None), Job.created_at < long_ago, ~lately)
     with database.reading() as session:
         rows = session.scalars(select(Job.row).where(*waiting)).all()
     for row in rows:
