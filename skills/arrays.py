@@ -32,6 +32,8 @@ def frozen(values: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: s
         BadInput: The shape is another one, or a number is NaN or infinite.
     """
     array = values if _is_frozen(values, dtype) else np.array(values, dtype=dtype, order="C", copy=True)
+    if array.dtype.kind == "f" and array.flags.writeable:
+        array += 0.0  # -0 is 0, so that equal numbers have equal digests
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         wanted = " x ".join("any" if n is None else str(n) for n in shape)
         raise BadInput(f"{name} has shape {array.shape}; give {wanted}.", shape=array.shape)

@@ -59,7 +59,7 @@ class SkillsError(Exception):
         """Name the kind after the class: OutsideGrid is outside-grid."""
         cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "-", cls.__name__).lower()
 
-    def __init__(self, message: str, *remedies: Remedy | str, **numbers: object) -> None:
+    def __init__(self, message: str, /, *remedies: Remedy | str, **numbers: object) -> None:
         super().__init__(message)
         self.message = message
         self.remedies = remedies

@@ -83,6 +83,12 @@ class DatasetKeywords(TypedDict, total=False):
         Sequence[str] | None, Doc("These demonstrations, by their digests; by default all that fit the filters.")
     ]
     surgeons: Annotated[Sequence[str] | None, Doc("Only of these surgeons.")]
+    without_surgeons: Annotated[
+        Sequence[str] | None,
+        Doc(
+            "Of all but these surgeons, such as one without consent; a whole recording that shows one of them is refused."
+        ),
+    ]
     sutures: Annotated[Sequence[str] | None, Doc("Only of these suture types.")]
     outcomes: Annotated[
         Literal["success", "any"],

@@ -54,6 +54,7 @@ class Action(StrEnum):
     MARK_DEMO = "mark-demo"
     TRAIN_ANY = "train-any"
     NAME_TOOL = "name-tool"
+    LEAVE_OUT_SURGEON = "leave-out-surgeon"
     NAME_FEATURES = "name-features"
     CUT_EPISODE = "cut-episode"
     ERASE_DEMOS = "erase-demos"

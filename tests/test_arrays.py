@@ -36,3 +36,7 @@ def test_frozen_arrays_of_another_type_or_order_are_converted():
         values.setflags(write=False)
         kept = frozen(values, np.float64, (2, 3), "values")
         assert (kept.dtype, kept.flags.c_contiguous) == (np.float64, True)
+
+
+def test_a_negative_zero_is_zero_so_that_equal_numbers_have_equal_digests() -> None:
+    assert not np.signbit(frozen([-0.0, 1.0], np.float64, (2,), "numbers")).any()

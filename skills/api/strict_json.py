@@ -1,4 +1,4 @@
-"""Strict JSON: a repeated name in an object is refused, and so are NaN and infinity.
+"""Strict JSON: a repeated name in an object is refused, and so are NaN and infinity; -0 is read as 0.
 
 A component that parses the request before this service, such as a proxy, may use the first of two values where Python
 uses the last.
@@ -41,7 +41,7 @@ def strictly_read(text: str | bytes) -> Any:
     Raises:
         JSONDecodeError: It is not JSON, an object repeats a name, or a number is not finite.
     """
-    return json.loads(text, object_pairs_hook=_once, parse_constant=_refuse)
+    return json.loads(text, object_pairs_hook=_once, parse_float=_number, parse_constant=_refuse)
 
 
 def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
@@ -49,6 +49,10 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     if len(made) < len(pairs):
         raise json.JSONDecodeError("An object has the same name twice", "", 0)
     return made
+
+
+def _number(text: str) -> float:
+    return float(text) + 0.0  # -0 is 0: equal requests have equal digests
 
 
 def _refuse(_constant: str) -> NoReturn:

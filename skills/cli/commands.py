@@ -21,6 +21,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from functools import partial, wraps
+from math import isfinite
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -72,6 +73,7 @@ OPTIONS = {
     "suture_points": "point",
     "start_mm": "start",
     "demos": "demo",
+    "without_surgeons": "without-surgeon",
     "surgeons": "surgeon",
     "sutures": "suture",
     "arms": "arm",
@@ -123,6 +125,7 @@ def command(
                     values[keywords] = {
                         field: parse(value) for field, (parse, value) in given.items() if value not in (None, [])
                     }
+                _refuse_not_finite(values)
                 answer = function(**values)
                 if answer is not None:
                     _print(answer, as_json)
@@ -142,6 +145,19 @@ def command(
         return run
 
     return register
+
+
+def _refuse_not_finite(values: Mapping[str, Any]) -> None:
+    """Refuse nan and inf, which Python reads as numbers.
+
+    Raises:
+        BadInput: A value, or a field of keyword arguments, is or has such a number.
+    """
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            _refuse_not_finite(value)
+        elif isinstance(value, float) and not isfinite(value):
+            raise BadInput(f"--{OPTIONS.get(name, name).replace('_', '-')} {value}: every number must be finite.")
 
 
 def _with_help(parameter: inspect.Parameter, helps: Mapping[str, str]) -> inspect.Parameter:
@@ -278,6 +294,8 @@ def numbers(text: str, count: int) -> list[float]:
         found = [float(part) for part in text.split(",")]
     except ValueError:
         found = []
+    if len(found) == count and not all(map(isfinite, found)):
+        raise BadInput(f"{text!r}: every number must be finite.")
     if len(found) != count:
         raise BadInput(f"{text!r} is not {count} numbers separated by commas.", "Example: 1,2.5,-3")
     return found

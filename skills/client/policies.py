@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
-from skills.client.connection import Connection
+from skills.client.connection import Connection, parse_text
 from skills.client.files import write_file
 from skills.client.waiting import in_thread
 from skills.errors import BadInput
@@ -198,7 +198,7 @@ class Policies(Connection):
         from skills.client.verifying import rebuild_policy  # slow to import
 
         document = await self._bytes(_path(version), JSON, surgeon=surgeon, suture=suture, version=version)
-        policy = Policy.model_validate_json(document)
+        policy = parse_text(Policy, document)
         arrays = await self._bytes("/policy-versions/{policy}", NPZ, policy=policy.sha256)
         demo = await self._bytes("/demos/{demo}", JSON, demo=policy.demos[0])
         return document, arrays, await in_thread(lambda: rebuild_policy(document, arrays, demo))

@@ -82,7 +82,7 @@ class Problem(SkillsError):
         for one in self.refused:
             one.given = _value_at(arguments, one.path)
         if self.refused:
-            self.message = "\n".join(one.sentence() for one in self.refused)
+            self.message = "\n".join(one.sentence() for one in self.refused).strip() or self.message
 
 
 class NotReached(SkillsError):
@@ -171,9 +171,10 @@ def problem_of(answer: httpx.Response) -> Problem:
 def _retry_after_s(answer: httpx.Response) -> float | None:
     """Return the seconds of a Retry-After header, which has seconds or a date; None without one."""
     said = answer.headers.get("retry-after", "").strip()
-    if said.isdigit():
-        return float(said)
     try:
-        return max(0.0, email.utils.parsedate_to_datetime(said).timestamp() - time.time())
-    except ValueError:
+        seconds = (
+            float(said) if said[:1].isdigit() else email.utils.parsedate_to_datetime(said).timestamp() - time.time()
+        )
+    except (ValueError, OverflowError):
         return None
+    return max(0.0, seconds)

@@ -122,6 +122,8 @@ class Latest:
 
 def latest_leaves(connection: Connection, table: str, keys: Sequence[str] | None = None) -> dict[str, Latest]:
     """Return the newest leaves of some rows that exist, or of all rows of a table, by key."""
+    if keys is not None and not keys:
+        return {}
     of = LEAVES.c
     # The newest of each row alone, because a row that changes often has very many.
     newest = select(func.max(of.row)).where(of.table_name == table, of.key.is_not(None)).group_by(of.key)

@@ -107,8 +107,13 @@ class Logged:
         for some in map(frozenset, in_parts(keys, ROWS_AT_ONCE)):
             # By the values with which the keys begin: few other rows share them, and all indexes begin with them.
             firsts = sorted({key if self.of_text else int(key.partition("/")[0]) for key in some})
-            rows = connection.execute(sa.select(self.raw).where(self.key_columns[0].in_(firsts)))
+            rows = connection.execute(self._by_firsts, {"firsts": firsts})
             yield from (row for row in rows if self.key_of(row) in some)
+
+    @cached_property
+    def _by_firsts(self) -> sa.Select[Any]:
+        """The query of the rows whose keys begin with some values, built once: every write of this table asks it."""
+        return sa.select(self.raw).where(self.key_columns[0].in_(sa.bindparam("firsts", expanding=True)))
 
     @cached_property
     def in_order(self) -> sa.Select[Any]:

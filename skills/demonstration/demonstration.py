@@ -237,6 +237,8 @@ def _segment_ns(recording: Recording, motion: Motion, start_s: float | None, end
     for name, value in (("start_s", start_s), ("end_s", end_s)):
         if value is not None and not np.isfinite(value):
             raise BadSegment(f"{name} is {value}; give seconds from the recording's start.")
+    if len(motion.stamps_ns) < 2:
+        raise BadSegment(f"{motion.topic} has one sample; a demonstration needs two at least.", samples=1)
     whole = recording.seconds(motion.stamps_ns[[0, -1]])
     begin = float(whole[0]) if start_s is None else start_s
     end = float(whole[1]) if end_s is None else end_s

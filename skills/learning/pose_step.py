@@ -5,7 +5,7 @@ window, it commands that pose and its phase.
 """
 
 from dataclasses import dataclass
-from math import atan2, isfinite, sin, sqrt
+from math import atan2, floor, isfinite, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,12 @@ from skills.arrays import Floats, Ints, frozen, xyz, xyzw
 from skills.compiled import compiled, inner
 from skills.errors import BadSettings
 from skills.fields import Point, Quaternion
+from skills.gridworld.grid import refuse_metres
 from skills.learning.pose_style import UNIT_TOLERANCE, PosePath, unit_quaternion
 from skills.learning.tube_certificate import TubeLimits
 
 ROUNDING = 1e-9  # mm and rad: a step computed in double precision is off by about 1e-14
+LATTICE = 6  # steps from the middle of a ball of starts to its border
 SMALLEST_SINE = 1e-6  # of half an angle: below it, a share of the chord equals a share of the arc to rounding
 
 
@@ -47,6 +49,7 @@ class PoseStep:
         jaw_rad: Angle of the jaw there; None if the path has none.
         phase: The phase after the tick.
         elapsed_s: Time of that phase from the start of the motion.
+        share_left: Share of the path's phases that follow it.
         off_mm: Distance of the pose that the hand has reached from that of the phase before the tick.
         off_rad: The angle between their orientations.
         finished: The phase is the last one, and its pose was reached before this tick.
@@ -57,6 +60,7 @@ class PoseStep:
     jaw_rad: float | None
     phase: int
     elapsed_s: float
+    share_left: float
     off_mm: float
     off_rad: float
     finished: bool
@@ -71,9 +75,8 @@ def next_pose(
         path: The motion to follow.
         tip_mm: Position in the frame of the path, shape (3,).
         rotation_xyzw: Orientation, a unit quaternion, shape (4,).
-        phase: The phase that the last call returned; None at the start: that of the nearest pose of the path, by the
-            larger of distance over `start_mm` and angle over `start_rad`.
-        limits: Steps and window; the disturbance is not used.
+        phase: The phase that the last call returned; None at the start: see `joined_phase`.
+        limits: Steps, window and joining rule; the disturbance is not used.
 
     Returns:
         The next pose.
@@ -81,6 +84,7 @@ def next_pose(
     Raises:
         BadInput: A number is not finite, or the quaternion is not a unit quaternion.
         BadSettings: There is no such phase.
+        OutsideGrid: The position seems to be in metres.
     """
     tip, rotation = _row(tip_mm, 3, "tip_mm"), _row(rotation_xyzw, 4, "rotation_xyzw")
     x, y, z, w = rotation[0].tolist()
@@ -88,10 +92,10 @@ def next_pose(
     if not abs(length - 1.0) <= UNIT_TOLERANCE:
         unit_quaternion(rotation[0], "rotation_xyzw")  # raises
     rotation /= length
+    refuse_metres("The position", tip[0], path.tip_mm[-1])
     last, along = len(path.tip_mm) - 1, (path.tip_mm, path.rotation_xyzw)
     if phase is None:
-        starts = max(float(limits.start_mm), ROUNDING), max(float(limits.start_rad), ROUNDING)
-        phase = nearest_pose(*along, tip, rotation, *starts)
+        phase = joined_phase(path, tip, rotation, limits)
     elif not 0 <= phase <= last:
         raise BadSettings(f"The path has the phases 0 to {last}.", phase=phase)
     phases, off = np.array([phase], np.int64), np.empty((1, 2))
@@ -104,10 +108,55 @@ def next_pose(
         None if path.jaw_rad is None else float(path.jaw_rad[after]),
         after,
         float(path.elapsed_s[after]),
+        (last - after) / last,
         off_mm,
         off_rad,
         bool(phase == last and off_mm <= limits.step_mm and off_rad <= limits.step_rad),
     )
+
+
+def joined_phase(path: PosePath, tip_mm: Floats, rotation_xyzw: Floats, limits: TubeLimits) -> int:
+    """Return the phase at which a start joins a path: that of the nearest pose with enough of the path left.
+
+    Args:
+        path: The motion to follow.
+        tip_mm: Position in the frame of the path, shape (1, 3).
+        rotation_xyzw: Orientation, a unit quaternion, shape (1, 4).
+        limits: The joining rule; near is by the larger of distance over `start_mm` and angle over `start_rad`.
+
+    Returns:
+        The phase, the first of equally near ones.
+    """
+    starts = max(float(limits.start_mm), ROUNDING), max(float(limits.start_rad), ROUNDING)
+    some = 1 + floor((1.0 - limits.join_share) * (len(path.tip_mm) - 1) + ROUNDING)
+    return int(nearest_pose(path.tip_mm[:some], path.rotation_xyzw[:some], tip_mm, rotation_xyzw, *starts))
+
+
+def near_share(path: PosePath, limits: TubeLimits, radius_mm: float) -> float:
+    """Return the least share of a path that a start near its first pose follows, if it is given no phase.
+
+    A pose that is the nearest of such a start is at most twice the radius from the first one. The starts on the lines
+    to these poses are tried, and where the path comes back to them, a lattice of others.
+
+    Args:
+        path: The motion to follow.
+        limits: The joining rule.
+        radius_mm: A start is near within this distance of the first pose, in its orientation.
+
+    Returns:
+        The share, 0 to 1; 1 of the first phase.
+    """
+    last, away_mm = len(path.tip_mm) - 1, path.tip_mm - path.tip_mm[0]
+    far_mm = np.linalg.norm(away_mm, axis=1, keepdims=True)
+    close = far_mm[:, 0] <= 2 * radius_mm
+    starts_mm = away_mm[close] * np.minimum(1.0, radius_mm / np.maximum(far_mm[close], ROUNDING))
+    if close[np.argmin(close) :].any():
+        steps = np.linspace(-radius_mm, radius_mm, 2 * LATTICE + 1)
+        lattice = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+        starts_mm = np.concatenate([starts_mm, lattice[np.linalg.norm(lattice, axis=1) <= radius_mm]])
+    first_xyzw = path.rotation_xyzw[:1]
+    joined = [joined_phase(path, path.tip_mm[:1] + one, first_xyzw, limits) for one in starts_mm]
+    return 1 - max(joined) / last
 
 
 def _row(values: ArrayLike, count: int, name: str) -> Floats:

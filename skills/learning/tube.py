@@ -81,6 +81,7 @@ def certified_poses(
     demos: Sequence[Demo],
     at: int = 0,
     partners: Sequence[PartnerMotion | None] | None = None,
+    join_share: float = 0.0,
 ) -> CertifiedPoses | None:
     """Learn the poses of a style, and certify the tube around them with the default limits.
 
@@ -89,6 +90,7 @@ def certified_poses(
         at: The index of the one at whose start and goal pose the motion lies.
         partners: The other arm along each demonstration; it is in the motion if every one has it, of the same arm. It
             has no part in the certificate.
+        join_share: The joining rule, as that of a learner: least share of the motion that a start is led to follow.
 
     Returns:
         The motion, whether its certificate holds or not; None if a demonstration has no orientation.
@@ -104,7 +106,9 @@ def certified_poses(
     style = learn_pose_style(demos, partners if len(arms) == 1 and None not in arms else None)
     assert place is not None and place.rotation_xyzw is not None, "checked above, and by `learn_pose_style`"
     path = style.between(place.tip_mm[0], place.rotation_xyzw[0], place.tip_mm[-1], place.rotation_xyzw[-1])
-    return CertifiedPoses(place.arm, style.frame, path, certify_tube(path, TubeLimits()), place.partner)
+    return CertifiedPoses(
+        place.arm, style.frame, path, certify_tube(path, TubeLimits(join_share=join_share)), place.partner
+    )
 
 
 def certify_tube(path: PosePath, limits: TubeLimits, update: Update = advance) -> TubeCertificate:
@@ -117,7 +121,14 @@ def certify_tube(path: PosePath, limits: TubeLimits, update: Update = advance) -
 
     Returns:
         The certificate, with the premises that do not hold.
+
+    Raises:
+        BadSettings: The window is not shorter than the path.
     """
+    if limits.ahead >= len(path.tip_mm):
+        raise BadSettings(
+            "The window of a tube must be shorter than its path.", ahead=limits.ahead, phases=len(path.tip_mm)
+        )
     moves = [_moves(path, ahead) for ahead in range(1, limits.ahead + 1)]
     move_mm, move_rad = (float(max(move[k] for move in moves)) for k in (0, 1))
     faults = []

@@ -7,6 +7,7 @@ import numpy as np
 
 from skills.errors import BadSettings
 from skills.fields import computed_field, schema
+from skills.gridworld.domain import check_join_share
 
 
 @schema
@@ -22,6 +23,7 @@ class TubeLimits:
         start_mm: Largest distance of a start from the path.
         start_rad: Largest angle of a start from the path's orientation there.
         ahead: Phases that one tick may advance.
+        join_share: The joining rule: least share of the phases that is left where a start joins the path.
     """
 
     step_mm: float = 6.0  # with 101 phases of a hand-off of 60 mm a phase is 0.6 mm on average, 2 mm where it is fast
@@ -31,9 +33,11 @@ class TubeLimits:
     start_mm: float = 20.0
     start_rad: float = 0.5
     ahead: int = 1
+    join_share: float = 0.0
 
     def __post_init__(self) -> None:
-        *numbers, ahead = astuple(self)
+        *numbers, ahead, join_share = astuple(self)
+        check_join_share(join_share)
         if not (np.isfinite(numbers).all() and min(numbers) >= 0 and 1 <= ahead <= 100):
             raise BadSettings("The limits of a tube are finite and not negative, and it looks 1 to 100 phases ahead.")
         if not (self.disturbance_mm < self.step_mm and self.disturbance_rad < self.step_rad):

@@ -81,6 +81,10 @@ class SuturePoint:
     position_mm: tuple[float, float, float]
     rotation_xyzw: tuple[float, float, float, float] = UNTURNED
 
+    def __post_init__(self) -> None:
+        for name in ("position_mm", "rotation_xyzw"):  # -0 is 0: it is the same point, with the same digest
+            object.__setattr__(self, name, tuple(number + 0.0 for number in getattr(self, name)))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pass(PassPath):

@@ -17,6 +17,8 @@ class DatasetIn(Schema):
     Attributes:
         demos: These demonstrations, by their digests; by default all that fit the filters.
         surgeons: Only of these surgeons.
+        without_surgeons: Of all but these surgeons, such as one without consent; a whole recording that shows one of
+            them is refused.
         sutures: Only of these suture types.
         outcomes: success leaves out demonstrations that are marked recovery or failure; any exports them in the splits
             recovery and failure.
@@ -39,6 +41,7 @@ class DatasetIn(Schema):
 
     demos: Annotated[list[DigestField], Field(min_length=1, max_length=1000)] | None = None
     surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
+    without_surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
     sutures: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
     outcomes: Literal["success", "any"] = "success"
     whole: StrictBool = False
@@ -53,7 +56,8 @@ class DatasetIn(Schema):
 
     @model_validator(mode="after")
     def _named_or_filtered(self) -> Self:
-        if self.demos is not None and (self.surgeons is not None or self.sutures is not None):
+        filters = self.surgeons, self.without_surgeons, self.sutures
+        if self.demos is not None and any(one is not None for one in filters):
             raise ValueError("name demonstrations in demos, or filter them by surgeons and sutures, but not both")
         if self.arms is not None and len({arm.lower() for arm in self.arms}) < len(self.arms):
             raise ValueError("name each arm once")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, StrictInt
 
 from skills.demonstration.partner import Partner
-from skills.fields import Count, Point, Quaternion, Sha256, Slug
+from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug
 from skills.learning.tube_certificate import TubeCertificate, TubeClearance
 from skills.schemas import Given, PolicyName
 from skills.schemas.requests import PointIn, QuaternionIn, Schema, shown
@@ -57,6 +57,7 @@ class PoseAnswer(Given):
     Attributes:
         phase: After this tick; to be sent with the pose that is reached then.
         elapsed_s: Time of that phase from the start of the motion.
+        share_left: Share of the style that follows that phase.
         off_mm: Distance of the pose that was sent from that of its phase.
         inside: Whether the pose that was sent lies in the tube.
         finished: Whether the last pose was reached.
@@ -69,6 +70,7 @@ class PoseAnswer(Given):
     jaw_rad: float | None
     phase: Count
     elapsed_s: float
+    share_left: Fraction
     off_mm: float
     off_rad: float
     inside: bool

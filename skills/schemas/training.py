@@ -60,7 +60,7 @@ class TrainingIn(Schema):
 
     surgeon: SlugField
     suture: SlugField
-    demos: list[DigestField] | None = None
+    demos: Annotated[list[DigestField], Field(min_length=1)] | None = None
     combine: CombineIn | None = None
     learner: LearnerIn | None = None
     seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = 0

@@ -366,3 +366,12 @@ def test_in_the_tube_that_is_not_narrowed_a_pushed_run_touches():
     scene = Scene("PSM2_base", boxes=(BESIDE,))
     poses, middle = in_scene(scene), np.array([30.0, 20.0, -120.0])
     assert pushed(poses, LIMITS, scene, middle) and not pushed(poses, poses.tube.limits, scene, middle)
+
+
+@pytest.mark.parametrize("ahead", [2, 3, 100])
+def test_a_window_that_is_not_shorter_than_the_path_is_refused(ahead: int):
+    path = a_path()
+    short = replace(path, **{name: value[:2] for name, value in vars(path).items() if np.shape(value)[:1] == (PHASES,)})
+    assert certify_tube(short, replace(LIMITS, start_mm=0.0)).move_mm > 0
+    with pytest.raises(BadSettings, match="window"):
+        certify_tube(short, replace(LIMITS, ahead=ahead))

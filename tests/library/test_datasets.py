@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from sqlalchemy import delete, select, text
 
-from skills.db.models import ParsedRecording, StoredRecording
+from skills.db.models import Demonstration, ParsedRecording, StoredRecording
 from skills.db.row_visibility import Only
 from skills.db.service_tables import DatasetDemonstration, Event, Job
 from skills.db.session import Database
@@ -28,6 +28,7 @@ from skills.library.perform import perform_job
 from skills.library.recordings.datasets import DatasetRequest, delete_dataset, export_dataset, find_dataset
 from skills.library.recordings.demos import mark_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
+from skills.remedies import Door
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from tests.library import cases, exports
@@ -346,6 +347,30 @@ def test_consent_is_required_for_a_request(database: Database):
     with pytest.raises(Conflict, match="consent of 'kestrel' does not cover export"):
         ask(database)
     assert kept(database) == NONE_LEFT
+
+
+def test_a_surgeon_without_consent_can_be_left_out_by_name(database: Database):
+    kept_one, _ = two_surgeons(database)
+    agree(database, NO_EXPORT, "wren")
+    with pytest.raises(Conflict) as refused:
+        ask(database)
+    assert "without_surgeons" in refused.value.words(Door.HTTP)
+    job = ask(database, without_surgeons=["wren"])
+    assert (job.request["episodes"], counted_demos(database, job)) == (1, [kept_one])
+    with pytest.raises(Conflict, match="another surgeon"):
+        ask(database, without_surgeons=["wren"], whole=True)
+    with pytest.raises(ValueError, match="but not both"):
+        ask(database, without_surgeons=["wren"], demos=[kept_one])
+
+
+def counted_demos(database: Database, job: Job) -> list[str]:
+    """Return the demonstrations of an export."""
+    of = DatasetDemonstration
+    query = (
+        select(Demonstration.sha256).join(of, of.demonstration_row == Demonstration.row).where(of.job_row == job.row)
+    )
+    with database.reading() as session:
+        return [*session.scalars(query)]
 
 
 def test_consent_withdrawn_during_the_job_stores_nothing(database: Database, monkeypatch: pytest.MonkeyPatch):

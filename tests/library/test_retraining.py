@@ -21,7 +21,7 @@ from skills.library.policies.batches import compare
 from skills.library.policies.learning import learn_style
 from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.people import SurgeonIn
-from skills.schemas.training import FitOnTheSame, PolicyFigures
+from skills.schemas.training import FitOnTheSame, PolicyFigures, TrainingIn
 from tests.library import cases
 from tests.library.styles import (
     NO_CONSENT,
@@ -114,6 +114,34 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
         withdraw_demo(session, newest.demonstration.sha256, "test")
     (style,) = styles_of(database, ask_retraining(database, only_stale=True, surgeon="kestrel"))
     assert (style.stale, style.demonstration_row) == (["a newer demonstration"], older.demonstration_row)
+
+
+@pytest.mark.parametrize("release", [False, True])
+def test_stale_styles_are_settled_by_a_batch_that_makes_an_older_version_again(database: Database, release: bool):
+    def stale(**asked: object) -> list[list[str]]:
+        return [
+            style.stale for style in styles_of(database, retrain(database, only_stale=True, release=release, **asked))
+        ]
+
+    add_styles(database, 3)
+    stale()
+    retrain(database, learner=ValueIteration(), release=release)
+    assert stale(surgeon="surgeon-0") == [["other settings"]] * 3
+    assert stale() == []
+    assert count_versions(database) == 6
+    again = ask_retraining(database, only_stale=True, release=release)
+    assert (again.state, again.request["styles"]) == ("succeeded", 0)
+    if release:  # somebody releases the other version of one of them: what the batch made is not served any more
+        with database.reading() as session:
+            other = session.scalars(select(PolicyVersion).where(PolicyVersion.version == 2)).first()
+        cases.release(database, other)
+        assert stale() == [["other settings"]]
+        assert stale() == []
+
+
+def test_no_demonstration_is_not_the_newest_one():
+    with pytest.raises(ValueError, match="demos"):
+        TrainingIn(surgeon="kestrel", suture=cases.SUTURE, demos=[])
 
 
 # ---- cancelling and erasing

@@ -77,6 +77,14 @@ def test_a_quarter_turn_about_z_by_hand():
     assert len(one.tip_mm) == len(path.states)
 
 
+def test_negative_zeros_are_the_same_point_and_start():
+    plans = [
+        stacked([SuturePoint((zero, 60.0, -160.0), (zero, zero, zero, 1.0))], starts_mm=[(zero, 55.0, -160.0)])
+        for zero in (0.0, -0.0)
+    ]
+    assert digest(plans[0]) == digest(plans[1])
+
+
 def test_every_pass_has_its_own_suture_point_and_start():
     path = named_path(NAME)
     points = [SuturePoint((10.0 * k, 0, -120)) for k in range(3)]

@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from string import Formatter
 from typing import Any, TypeVar
@@ -19,6 +20,7 @@ from skills.client.blocking.waiting import in_thread, upload_body
 from skills.client.files import CHUNK_BYTES, Download, FileUpload, Progress, check_digest, digest_of_etag
 from skills.client.problems import NotReached, NotUnderstood, Problem, problem_of, showing_given
 from skills.client.retrying import Retrying, may_repeat
+from skills.errors import BadInput
 from skills.schemas import Page
 
 PAGE_LENGTH = 200  # the longest page that the service returns
@@ -81,6 +83,7 @@ class Connection:
     ) -> httpx.Response:
         content = None if body is None else to_jsonable_python(given(body), fallback=_plain)
         target, query = fill(path, named)
+        _refuse_not_finite({**query, **(content or {})})
         with showing_given({**named, **(content or {})}):
             return self._send(
                 method, target, idempotent=idempotent, params=query, json=content, headers={"Accept": accept}
@@ -132,7 +135,8 @@ class Connection:
         def attempt() -> Path:
             with self._opened("GET", target, headers={"Accept": accept}, params=query) as answer:
                 digest = sha256 or digest_of_etag(answer.headers.get("etag", ""))
-                total = int(answer.headers.get("content-length", 0))
+                length = answer.headers.get("content-length", "")
+                total = int(length) if length.isdecimal() else 0
                 file = in_thread(lambda: Download(to, digest))
                 try:
                     for chunk in answer.iter_bytes(CHUNK_BYTES):
@@ -228,6 +232,19 @@ def given(values: Mapping[str, T]) -> dict[str, T]:
     return {name: value for name, value in values.items() if value is not None}
 
 
+def _refuse_not_finite(value: Any, path: tuple[str, ...] = ()) -> None:
+    """Refuse a number that JSON does not have.
+
+    Raises:
+        BadInput: There is one; the message says where.
+    """
+    if isinstance(value, float) and not isfinite(value):
+        raise BadInput(f"{'.'.join(path)} is {value}; every number must be finite.")
+    named = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list | tuple) else ()
+    for name, part in named:
+        _refuse_not_finite(part, (*path, str(name)))
+
+
 def as_json(answer: httpx.Response) -> Any:
     """Return the JSON of a response.
 
@@ -254,8 +271,20 @@ def _parse(kind: type[M], answer: Any) -> M:
     Raises:
         NotUnderstood: The response does not fit the model.
     """
-    try:
+    with _fitting(kind):
         return kind.model_validate(answer)
+
+
+def parse_text(kind: type[M], text: str | bytes) -> M:
+    """Return the JSON of a response, or of an event in one, as its model; raises as `_parse` does."""
+    with _fitting(kind):
+        return kind.model_validate_json(text)
+
+
+@contextmanager
+def _fitting(kind: type[BaseModel]) -> Iterator[None]:
+    try:
+        yield
     except ValidationError as error:
         where = ", ".join(".".join(str(part) for part in one["loc"]) for one in error.errors()[:5])
         raise NotUnderstood(

@@ -8,7 +8,7 @@ from typing import Literal
 
 import httpx2 as httpx
 
-from skills.client.blocking.connection import Connection
+from skills.client.blocking.connection import Connection, parse_text
 from skills.client.problems import JobFailed, JobTakesLonger, NotReached, NotUnderstood, Problem
 from skills.schemas.operation import Job
 from skills.schemas.people import Key, NewKey
@@ -96,7 +96,7 @@ class Operation(Connection):
                 return
             for line in answer.iter_lines():
                 if line.startswith("data:"):  # the service writes each event's data on one line
-                    yield Job.model_validate_json(line.removeprefix("data:"))
+                    yield parse_text(Job, line.removeprefix("data:"))
                 if self._clock() >= over_s:  # heartbeats may continue for ever
                     return
 

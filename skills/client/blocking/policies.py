@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
-from skills.client.blocking.connection import Connection
+from skills.client.blocking.connection import Connection, parse_text
 from skills.client.blocking.waiting import in_thread
 from skills.client.files import write_file
 from skills.errors import BadInput
@@ -199,7 +199,7 @@ class Policies(Connection):
         from skills.client.verifying import rebuild_policy  # slow to import
 
         document = self._bytes(_path(version), JSON, surgeon=surgeon, suture=suture, version=version)
-        policy = Policy.model_validate_json(document)
+        policy = parse_text(Policy, document)
         arrays = self._bytes("/policy-versions/{policy}", NPZ, policy=policy.sha256)
         demo = self._bytes("/demos/{demo}", JSON, demo=policy.demos[0])
         return document, arrays, in_thread(lambda: rebuild_policy(document, arrays, demo))

@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict
-from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
+from sqlalchemy import ColumnElement, ScalarSelect, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
 from skills.db import now
@@ -67,20 +67,22 @@ def changed_since(session: Session, batch: int) -> set[int]:
     release: another version than the one it was compared with.
     """
     of, by = StyleToRetrain, Demonstration
-    served = (
-        select(PolicyVersion.sha256)
-        .join(Release, Release.policy_row == PolicyVersion.row)
-        .where(Release.surgeon_row == by.surgeon_row, Release.suture == by.suture, is_served())
-        .correlate(by)
-        .scalar_subquery()
-    )
-    done = select(by.row, of.comparison, served).join(by, by.row == of.demonstration_row)
+    done = select(by.row, of.comparison, served_now()).join(by, by.row == of.demonstration_row)
     mine = of.job_row == batch, of.state == "done", ~_serving()
-    return {row for row, compared, now in session.execute(done.where(*mine)) if now != _served_then(compared)}
+    return {row for row, compared, now in session.execute(done.where(*mine)) if now != served_then(compared)}
 
 
-def _served_then(comparison: StoredComparison) -> str | None:
-    """Return the digest of the version that a style served when a batch ended it."""
+def served_now() -> ScalarSelect[str]:
+    """Return the digest of the version that the style of a `Demonstration` serves, as a subquery."""
+    by = Demonstration
+    served = select(PolicyVersion.sha256).join(Release, Release.policy_row == PolicyVersion.row)
+    mine = (Release.surgeon_row == by.surgeon_row, Release.suture == by.suture, is_served())
+    return served.where(*mine).correlate(by).scalar_subquery()
+
+
+def served_then(comparison: StoredComparison | None) -> str | None:
+    """Return the digest of the version that a style served when a batch ended it, of one that is done."""
+    assert comparison is not None
     served = comparison.trained if comparison.now_released else comparison.released
     return None if served is None else served.sha256
 

@@ -277,7 +277,8 @@ def _refused(name: StepName, refused: SkillsError, others: Sequence[Choice]) -> 
 def _describe_recording(parsed: ParsedContent) -> str:
     about = parsed.about
     motions = "; ".join(
-        f"{one.arm} in {one.frame}, {one.samples} samples at {quality.rate_hz:.0f} Hz"
+        f"{one.arm} in {one.frame}, {one.samples} samples"
+        + ("" if quality.rate_hz is None else f" at {quality.rate_hz:.0f} Hz")
         for one, quality in zip(about.motions, about.quality, strict=True)
     )
     return f"A recording of {about.duration_s:.1f} s ({parsed.recording.format}): {motions}."

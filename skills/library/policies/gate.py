@@ -16,6 +16,8 @@ from skills.learning.certificate import (
 )
 from skills.learning.dynamic_programming import FAINT
 from skills.learning.policy import Policy
+from skills.learning.pose_step import near_share
+from skills.learning.tube import CertifiedPoses
 from skills.planning.plan import DrivenPass, driven_pass
 from skills.schemas.policies import GateRefusal, RefusalKind
 from skills.settings import Settings
@@ -31,8 +33,8 @@ _REMEDIES: dict[RefusalKind, str] = {
     "faint": "Train it with a gamma nearer to 1, or lay the demonstration on larger cells.",
     "not optimal": _OTHERWISE,
     "unreached": _OTHERWISE,
-    "scene odds": "Train it with value-iteration or a smaller slip, or record the hand-off further from the scene; the "
-    "limits are SKILLS_SCENE_LEAST_FINISHING and SKILLS_SCENE_MOST_TOUCHING.",
+    "scene odds": "Train it with a smaller slip (by value-iteration, if another learner made it), or record the "
+    "hand-off further from the scene; the limits are SKILLS_SCENE_LEAST_FINISHING and SKILLS_SCENE_MOST_TOUCHING.",
     "frame": "Record the arm's local/measured_cp, which is in its base, or its measured_js.",
     "joint limits": "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere.",
     "jaw held": "Train it again, and request its release.",
@@ -125,6 +127,19 @@ def _not_the_style(policy: Policy, certificate: Certificate, near: NearStarts) -
             f"{near.share:.0%} of the demonstration, and the gate requires {near.least_share:.0%}; train with a "
             f"joining rule such as --join {max(near.least_share, 0.5):g}, which leads them back to an earlier part",
         )
+
+
+def pose_refusals(poses: CertifiedPoses | None, near: NearLimits) -> list[GateRefusal]:
+    """Return the reason why the pose style of a version is against its release, if it is; NaN fails."""
+    share = 1.0 if poses is None else near_share(poses.path, poses.tube.limits, near.radius_mm)
+    if share >= near.least_share:
+        return []
+    text = (
+        f"of the starts within {near.radius_mm:g} mm of the pose style's first pose, one joins it where {share:.0%} is "
+        f"left, and the gate requires {near.least_share:.0%}; train phase-q-learning or value-iteration with a joining "
+        f"rule such as --join {max(near.least_share, 0.5):g}"
+    )
+    return [GateRefusal("near starts", text)]
 
 
 def driven_or_refused(policy: Policy, demo: Demo) -> tuple[DrivenPass | None, list[GateRefusal]]:

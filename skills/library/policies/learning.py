@@ -32,7 +32,7 @@ from skills.learning.tube import certified_poses
 from skills.library.operation.integrity import poses_identity_of, scene_digest
 from skills.library.people.consent import refusal, require
 from skills.library.policies.combined import describe_combined
-from skills.library.policies.gate import driven_or_refused, refusals
+from skills.library.policies.gate import driven_or_refused, pose_refusals, refusals
 from skills.library.policies.releases import Style
 from skills.library.policies.requests import TrainingRequest
 from skills.library.recordings.recordings import Parser, stored_recording
@@ -228,7 +228,7 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
         in_scene, odds = certify_in_scene(policy, policy.hazards)
         covered = replace(covered, finishing=odds.finishes, touching=odds.touches)
     shown = [unpack_as(Demo, one) for one in lesson.shown] or [demo]
-    poses = certified_poses(shown, lesson.at, partners=lesson.partners)
+    poses = certified_poses(shown, lesson.at, lesson.partners, policy.learner.join_share)
     numbers, coverage = seal(policy), seal(covered)
     driven, undriven = driven_or_refused(policy, demo)
     near = near_starts(policy, covered.share, request.near)
@@ -269,7 +269,11 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
             suboptimal_actions=certificate.suboptimal,
             actions_off_rule=certificate.off_rule,
             demonstration_reproduced=certificate.demonstration_reproduced,
-            refused_because=(*refusals(policy, certificate, near, chances), *undriven),
+            refused_because=(
+                *refusals(policy, certificate, near, chances),
+                *pose_refusals(poses, request.near),
+                *undriven,
+            ),
             gate=request.gate,
             near=near,
             driven=driven,

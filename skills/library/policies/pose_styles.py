@@ -65,7 +65,8 @@ def poses_of_demonstrations(version: PolicyVersion) -> CertifiedPoses | None:
     """
     demos, combined = version.demonstrations, version.manifest.combined
     at = 0 if combined is None else [one.sha256 for one in demos].index(combined.at)
-    return certified_poses([one.demo for one in demos], at)
+    join_share = version.manifest.settings.get("join_share", 0.0)
+    return certified_poses([one.demo for one in demos], at, join_share=join_share)
 
 
 def describe_pose_style(version: PolicyVersion, poses: CertifiedPoses) -> PoseStyle:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from sqlalchemy import ColumnElement, Text, cast, func, insert, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import now
+from skills.db import in_parts, now
 from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
@@ -226,7 +226,8 @@ def _reasons(
     """Return, by demonstration, why its style's newest version is stale; an empty list if it is up to date.
 
     It is up to date if it was learnt from this demonstration with the settings of the training that would be made, in
-    the same scene, not refused by an older gate, and checked with the same limits.
+    the same scene, not refused by an older gate, and checked with the same limits. So is a style of which the last
+    batch has made such a version, which may be an older one; with `release`, if it serves what it served then.
     """
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
@@ -241,18 +242,41 @@ def _reasons(
         demo = of_style.get((who, what))
         if demo is None:
             continue
-        manifest = PolicyManifest.model_validate_json(text)
-        made, wanted = request_of(manifest), trainings[demo.row]
-        found = {
-            "a newer demonstration": demo.sha256 not in made.demos,
-            "another scene": made.surroundings != wanted.surroundings,
-            "other settings": (made.learner, made.seed) != (wanted.learner, wanted.seed),
-            "a newer learner": manifest.learner_version != wanted.learner_version,
-            "refused by an older gate": not releasable and manifest.grid_certificate.gate != wanted.gate,
-            "other limits at the near starts": made.near != wanted.near or made.odds not in (None, asked.odds),
-        }
-        reasons[demo.row] = [reason for reason, holds in found.items() if holds]
+        reasons[demo.row] = _differences(demo, PolicyManifest.model_validate_json(text), releasable, trainings, asked)
+    stale = {demo.row: demo for demo in demos if reasons[demo.row]}
+    made = StyleToRetrain
+    last_made = select(func.max(made.row)).where(made.state == "done").group_by(made.demonstration_row)
+    columns = made.demonstration_row, of.releasable, cast(of.manifest, Text), made.comparison, jobs.served_now()
+    again = select(*columns).join(made.policy).join(Job, Job.row == made.job_row).join(made.demonstration)
+    again = again.where(Job.request["release"].as_boolean() == asked.release)
+    for some in in_parts([*stale]):
+        of_some = last_made.where(made.demonstration_row.in_(some))
+        for row, releasable, text, compared, now_serves in in_pieces(session, again.where(made.row.in_(of_some))):
+            manifest = PolicyManifest.model_validate_json(text)
+            differs = _differences(stale[row], manifest, releasable, trainings, asked)
+            if not differs and (not asked.release or now_serves == jobs.served_then(compared)):
+                reasons[row] = []
     return reasons
+
+
+def _differences(
+    demo: _Newest,
+    manifest: PolicyManifest,
+    releasable: bool,
+    trainings: dict[int, TrainingRequest],
+    asked: RetrainingRequest,
+) -> list[str]:
+    """Return why a version is not what a training would make of its style."""
+    made, wanted = request_of(manifest), trainings[demo.row]
+    found = {
+        "a newer demonstration": demo.sha256 not in made.demos,
+        "another scene": made.surroundings != wanted.surroundings,
+        "other settings": (made.learner, made.seed) != (wanted.learner, wanted.seed),
+        "a newer learner": manifest.learner_version != wanted.learner_version,
+        "refused by an older gate": not releasable and manifest.grid_certificate.gate != wanted.gate,
+        "other limits at the near starts": made.near != wanted.near or made.odds not in (None, asked.odds),
+    }
+    return [reason for reason, holds in found.items() if holds]
 
 
 def _divide(session: Session, job: Job, styles: Sequence[tuple[int, list[str]]], size: int) -> None:

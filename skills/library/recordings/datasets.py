@@ -118,7 +118,12 @@ def request_dataset(session: Session, asked: DatasetIn, actor: str) -> Requested
     splits = _splits(chosen, asked)
     arms = _arms(session, chosen, asked.arms)
     recorded = recorded_in(session, episodes_of([one.row for one in chosen], whole=asked.whole))
-    recorded.require("export", {one.surgeon_row for one in chosen})
+    try:
+        recorded.require("export", {one.surgeon_row for one in chosen})
+    except Conflict as refused:
+        if asked.demos is None:
+            refused.remedies = (*refused.remedies, Remedy(Action.LEAVE_OUT_SURGEON))
+        raise
     request = DatasetRequest(
         **asked.model_dump(include={*DatasetRequest.model_fields}) | {"arms": arms},
         consent=describe_consents(recorded.surgeons),
@@ -149,6 +154,8 @@ def _chosen(session: Session, asked: DatasetIn) -> list[_Chosen]:
     query = query.where(of.withdrawn_at.is_(None) if asked.outcomes == "any" else of.learnable)
     if asked.surgeons is not None:
         query = query.where(of.surgeon_row.in_([find_surgeon(session, one).row for one in asked.surgeons]))
+    if asked.without_surgeons is not None:
+        query = query.where(of.surgeon_row.not_in([find_surgeon(session, one).row for one in asked.without_surgeons]))
     if asked.sutures is not None:
         query = query.where(of.suture.in_([find_suture_type(session, one).slug for one in asked.sutures]))
     found = [_Chosen(*one) for one in session.execute(query.limit(MOST + 1))]
