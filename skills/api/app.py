@@ -4,6 +4,7 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from math import inf
+from weakref import WeakValueDictionary
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
@@ -104,6 +105,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.metrics = ServiceMetrics(app.state.database, settings.lease_s)
     app.state.sessions = Sessions(app.state.database, app.state.served.changes, settings)
     app.state.metrics.sessions.set_function(lambda: app.state.sessions.places.count)
+    app.state.equal_uploads = WeakValueDictionary()  # of this moment, by route and digest
     app.state.downloads = CapacityLimiter(DOWNLOADS_READ)
     app.state.access = Access(app.state.database, settings)
     # `include_router` would analyse every route again, at the first request of each application: 90 ms.

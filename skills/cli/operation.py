@@ -257,7 +257,6 @@ def verify(
         with bag.open("rb") as file:
             lines = verify_bag(file, None if key is None else read_key(key))
         return outcome("\n".join(lines), whole=True, checked=lines)
-    from skills.library.operation.history import sign_some_history
     from skills.library.operation.inspection import inspect_installation
     from skills.library.recordings.recordings import confined_reader
     from skills.settings import settings
@@ -266,7 +265,6 @@ def verify(
     found: dict[str, Checked] = {}
     with installation() as database, confined_reader(settings()) as reader, status_line("verifying") as update:
         heads = None if head is None else read_notes(head.read_text())
-        sign_some_history(database)
         for part in inspect_installation(
             database,
             reader.parse,
