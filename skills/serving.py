@@ -317,7 +317,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
 
 # Ours: frames that complete no message, which a client needs every few seconds to ping. They never reach a session.
 FRAMES, FRAMES_PER_S = 20, 5.0
-SLICE_BYTES = 1024  # parsed before the next ones: a client that sends many frames at once must not hold up the others
+SLICE_BYTES = 256  # parsed before the next ones: a client that sends many frames at once must not hold up the others
 FLOODED_BY_FRAMES = f"At most {FRAMES_PER_S:g} frames without a message a second, and {FRAMES} at once."
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from threading import get_ident
-from time import monotonic, sleep, thread_time
+from time import monotonic, sleep
 from typing import Any
 
 import pytest
@@ -267,12 +267,12 @@ def test_the_capacity_is_measured_and_what_was_admitted_counts_until_it_sends(mo
                     number += 1
             found.append(number)
             before_s = capacity._message_s
-            began_s, busy_s = monotonic(), thread_time()
+            began_s = monotonic()
             while monotonic() - began_s < 0.5:
                 capacity.messages += 1000
                 await asyncio.sleep(0.001)
-            assert capacity._message_s < before_s, "a thousand messages in a millisecond take less"
-            assert capacity._load <= (thread_time() - busy_s) / 0.05
+            assert capacity._message_s < before_s / 2, "a thousand messages in a millisecond take less"
+            assert capacity._load > 0
             assert sum(capacity._admitted) == 0
         measuring.cancel()
         return found
