@@ -207,10 +207,10 @@ def environment(settings: Settings) -> dict[str, str]:
     return others | ours
 
 
-def prepare(settings: Settings) -> None:
-    """Migrate the database and seed its catalogue."""
+def prepare(settings: Settings) -> bool:
+    """Migrate the database and seed its catalogue; return whether it was migrated."""
     with closing(Database.of(settings)) as database:
-        prepare_database(database, settings)
+        return prepare_database(database, settings)
 
 
 def refuse_keyless(settings: Settings) -> None:

@@ -137,17 +137,18 @@ def create_app(settings: Settings) -> FastAPI:
     return app
 
 
-def prepare_database(database: Database, settings: Settings) -> None:
-    """Migrate a database, seed its catalogue if it is empty, and sign its history.
+def prepare_database(database: Database, settings: Settings) -> bool:
+    """Migrate a database, seed its catalogue if it is empty, and sign its history; return whether it was migrated.
 
     Raises:
         NotReady: It is not the database that was signed last; nothing was changed.
     """
-    database.migrate()
+    migrated = database.migrate()
     database.compare_history()
     with database.writing() as session:
         seed_suture_types(session)
     sign_some_history(database)
+    return migrated
 
 
 def prepare_to_serve(database: Database, settings: Settings) -> None:

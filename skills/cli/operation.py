@@ -93,8 +93,9 @@ def migrate() -> Answer:
     from skills.serving import prepare
     from skills.settings import settings
 
-    prepare(settings())
-    return outcome("The database is up to date.", up_to_date=True)
+    migrated = prepare(settings())
+    did = "The database was migrated" if migrated else "Nothing was to be migrated: the database is up to date"
+    return outcome(f"{did}.", up_to_date=True, migrated=migrated)
 
 
 @command(commands)

@@ -156,8 +156,11 @@ class Database:
         checked._condition = check, names
         return checked
 
-    def migrate(self) -> None:
+    def migrate(self) -> bool:
         """Migrate the tables to this version, from an empty database or any older version since 0.3.0.
+
+        Returns:
+            Whether that changed anything.
 
         Raises:
             NotReady: They would be changed, and it is not the database that was signed last.
@@ -181,6 +184,7 @@ class Database:
             with self.writing() as session:
                 session.execute(text(LOG_SEQUENCES))
         self.reserve_space()
+        return before != revisions()[0]
 
     def reserve_space(self) -> None:
         """Allocate the space that `ending` uses on a full disk; on PostgreSQL the operator provides it."""
