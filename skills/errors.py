@@ -207,6 +207,10 @@ class MixedFrames(BadRecording):
     """The poses of one topic are in more than one frame."""
 
 
+class MixedSources(BadRecording):
+    """Two publishers write to one topic at the same time."""
+
+
 class BackwardStamps(BadRecording):
     """Time stamps decrease, more often or by more than can be dropped."""
 
@@ -221,6 +225,10 @@ class NotFinite(BadRecording):
 
 class NotMetres(BadRecording):
     """A magnitude cannot be metres of a PSM; it is never rescaled by guess."""
+
+
+class ImplausibleMotion(BadRecording):
+    """No PSM moves so, or no recorder samples so: times or lengths are in another unit, or the tip jumps."""
 
 
 class NotAQuaternion(BadRecording):

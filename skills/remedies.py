@@ -68,7 +68,6 @@ class Action(StrEnum):
     PLAY = "play"
     ADD_PLAYBACK = "add-playback"
     DRAW = "draw"
-    JOIN_BAG = "join-bag"
     DECIMAL_COMMA = "decimal-comma"
     NAME_COLUMNS = "name-columns"
     NAME_UNIT = "name-unit"

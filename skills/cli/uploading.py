@@ -46,6 +46,8 @@ def ready(path: Path) -> Iterator[tuple[Path, "Progress"]]:
     from skills.formats.upload import find_bag, prepare_upload
 
     bag = find_bag(path)
+    for name in bag.left_aside:
+        typer.echo(f"{name} is neither JSON nor a recorder's: left aside.", err=True)
     read = 0
     with bar("reading") as reading:
 

@@ -19,6 +19,7 @@ import numpy as np
 from skills.arrays import Floats, freeze
 from skills.demonstration.movement import Pause, clutched, is_driven, undriven
 from skills.demonstration.partner import Partner, PartnerMotion, in_base, partner_along, partner_at
+from skills.demonstration.plausible import check_steps
 from skills.demonstration.recording import BaseFrame, Motion, Recording, base_frames
 from skills.errors import BadSegment, JointsDisagree, NotMetres
 from skills.notebook import card
@@ -116,9 +117,12 @@ def cut_demo(
         BadSegment: The segment is not finite, ends before it starts, lies outside the recording, holds fewer than 2
             samples of a driven arm, or has more than 200 pauses in which the arm was not driven.
         NotMetres: The path's extent is below 1 mm or above 300 mm.
+        ImplausibleMotion: Between two samples the tip moves further than a PSM can.
         JointsDisagree: The joints recorded beside the poses contradict them, or the stated instrument.
     """
     motion = recording.motion_of(arm=arm, topic=topic)
+    if len(motion.stamps_ns) < 2:
+        raise BadSegment(f"{motion.topic} has a single pose; a demonstration needs at least 2.", samples=1)
     _check_joints(recording, motion)
     first_ns, last_ns = _segment_ns(recording, motion, start_s, end_s)
     within = (motion.stamps_ns >= first_ns) & (motion.stamps_ns <= last_ns)
@@ -136,6 +140,7 @@ def cut_demo(
     bases, base = base_frames(recording), recording.base_under(motion)
     tip_mm = motion.tip_mm[inside]
     rotation_xyzw = None if motion.rotation_xyzw is None else motion.rotation_xyzw[inside]
+    check_steps(motion.topic, seconds, tip_mm)
     partner = partner_at(recording, motion, float(seconds[-1]), bases)
     if base is not None:
         tip_mm, rotation_xyzw = _in_base(base, tip_mm, rotation_xyzw)

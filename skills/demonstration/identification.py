@@ -68,7 +68,7 @@ class Identification:
 
     Attributes:
         verdict: "identified": one arm with one instrument explains poses and joints, or several of equal lengths;
-            "undetermined": the motion is too small to tell several apart;
+            "undetermined": the motion is too small, or joints and poses agree too little, to tell several apart;
             "wrong instrument": the stated one does not fit, and another one does;
             "wrong frame": the poses are not relative to the arm's base, as the recording states;
             "moved frame": each part fits by itself: the camera or the set-up joints moved;
@@ -334,6 +334,12 @@ def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) ->
     lengths = np.array([(fit.of.offset_mm, fit.of.wrist_mm) for fit in near])
     if not stood or not (np.ptp(lengths, axis=0) <= SAME_MM).all():
         reason = f"the motion is too small to tell {len(found.candidates)} instruments apart ({names})"
+        if best.residual_mm > MARGIN * FLOOR_MM:
+            reason = (
+                f"joints and poses agree to {best.residual_mm:.2f} mm (root mean square), those of sound recordings to "
+                f"{FLOOR_MM} mm, so {len(found.candidates)} instruments fit ({names}): the zero of a joint, as of the "
+                "insertion, is off, the frame of the poses moved, or their stamps are not those of the joints"
+            )
         return replace(found, verdict="undetermined", instrument=None, generation=None, reason=reason)
     return replace(found, reason=f"joints and poses fit {names}")
 

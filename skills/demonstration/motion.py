@@ -16,11 +16,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skills.arrays import Flags, Floats, Ints, frozen
-from skills.errors import BackwardStamps, NotAQuaternion, NotFinite, NotMetres, NoUsableTopic, RepeatedStamps
+from skills.errors import (
+    BackwardStamps,
+    ImplausibleMotion,
+    NotAQuaternion,
+    NotFinite,
+    NotMetres,
+    NoUsableTopic,
+    RepeatedStamps,
+)
 
 COORDINATE_LIMIT_MM = 1000.0  # ours: a PSM reaches 0.3 m; far beyond it millimetres were taken for metres
+JAW_RAD = np.pi  # ours: instruments open by 1.4 rad and close to -0.7, JIGSAWS has -1.9 to 0.6; degrees exceed it
 QUATERNION_TOLERANCE = 1e-3  # ours: three printed decimals pass, an unnormalised quaternion does not
+UNSET_NS, SET_NS = 10**15, 10**17  # 11 days and 3 years after 1970: of a clock that was not set, and of one that was
 DROPPED_SHARE_LIMIT = 0.01  # ours: a real bag loses 1 of 3300; with more, the stamps are not the times of the samples
+LATE_EVENT_NS = 100_000_000  # ours: nobody presses a pedal twice in that time
 DROPPED_GAP_NS = 50_000_000  # ours: a tip at 100 mm/s moves by 5 mm in it, one cell of the paper's grid
 
 
@@ -97,7 +108,7 @@ def check_finite(topic: str, stamps_ns: Ints, values: Floats) -> None:
 
 
 def check_forwards(topic: str, stamps_ns: Ints) -> None:
-    """Refuse time stamps that run backwards; equal stamps pass.
+    """Refuse time stamps that run backwards, and those before a clock was set; equal stamps pass.
 
     Args:
         topic: The topic, for the message.
@@ -105,6 +116,7 @@ def check_forwards(topic: str, stamps_ns: Ints) -> None:
 
     Raises:
         BackwardStamps: A stamp is earlier than the one before it.
+        ImplausibleMotion: The first are days after 1970 and later ones years.
     """
     back = stamps_ns[1:] < stamps_ns[:-1]
     if back.any():
@@ -116,6 +128,15 @@ def check_forwards(topic: str, stamps_ns: Ints) -> None:
             topic=topic,
             sample=first,
             step_s=step_s,
+        )
+    if len(stamps_ns) and stamps_ns[0] < UNSET_NS and stamps_ns[-1] > SET_NS:
+        first = int(np.searchsorted(stamps_ns, UNSET_NS))
+        raise ImplausibleMotion(
+            f"{topic}: the clock was not set in {first} sample{'s' * (first > 1)} at the start: the stamp is "
+            f"{stamps_ns[first - 1] / 1e9:g} s, and the next one {stamps_ns[first] / 1e9:.9g} s. Cut the recording "
+            f"before sample {first}.",
+            topic=topic,
+            sample=first,
         )
 
 
@@ -171,7 +192,7 @@ class Motion:
     @property
     def is_local(self) -> bool:
         """Whether the poses are relative to the arm's own remote centre. The topic decides: frame names differ."""
-        return "/local/" in self.topic
+        return "/local/" in self.topic or self.topic.endswith("/position_cartesian_local_current")  # of dVRK 1.x
 
     @property
     def states_base(self) -> bool:
@@ -369,12 +390,53 @@ def recorded_signal(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
     Raises:
         BackwardStamps: As in `forward_samples`.
         NotFinite: A value is NaN or infinite.
+        NotMetres: An angle is beyond `JAW_RAD`.
     """
+    wide = np.abs(values) > JAW_RAD
+    if wide.any() and np.isfinite(values).all():  # those that are not are refused below
+        first = int(np.argmax(wide))
+        raise NotMetres(
+            f"{topic}: a jaw's angle of {values[first]:g} rad {_at(stamps_ns, first)}; a jaw opens by less than "
+            f"{JAW_RAD:.4g} rad. Is it in degrees? Give radians, or name the unit of the column, as in jaw_deg.",
+            topic=topic,
+            sample=first,
+        )
     kept, _, backward = forward_samples(topic, stamps_ns, values, equal_stamps=True)
     if kept is None:
         return Signal(stamps_ns, values, topic)
     check_finite(topic, stamps_ns, values)
     return Signal(stamps_ns[kept], values[kept], topic, backward)
+
+
+def recorded_events(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
+    """Make a signal of events, such as the presses of a pedal: in order of time, without those recorded again later.
+
+    A recorder repeats the last message of such a topic at the start of each part of a bag, with its first stamp. Events
+    that were received out of order, by up to `LATE_EVENT_NS`, are put in the order of their stamps: none is lost.
+
+    Args:
+        stamps_ns: Integer nanoseconds, shape (T,), in the order of the recording.
+        values: The states after the events, shape (T,).
+        topic: The source.
+
+    Returns:
+        The signal, with the number of dropped messages in `backward_stamps`.
+
+    Raises:
+        BackwardStamps: A stamp goes back further, to one at which there was no such event.
+        NotFinite: A value is NaN or infinite.
+    """
+    if (stamps_ns[1:] > stamps_ns[:-1]).all():
+        return Signal(stamps_ns, values, topic)
+    seen, kept = set[tuple[int, float]](), list[bool]()
+    for event in zip(stamps_ns.tolist(), values.tolist(), strict=True):
+        kept.append(event not in seen)
+        seen.add(event)
+    stamps_ns, values = stamps_ns[kept], values[kept]
+    if (np.maximum.accumulate(stamps_ns) - stamps_ns <= LATE_EVENT_NS).all():
+        order = np.argsort(stamps_ns, kind="stable")
+        stamps_ns, values = stamps_ns[order], values[order]
+    return Signal(stamps_ns, values, topic, kept.count(False))
 
 
 def recorded_joints(arm: str, topic: str, stamps_ns: Ints, positions: Floats) -> Joints:

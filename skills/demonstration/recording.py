@@ -29,6 +29,7 @@ from skills.demonstration.motion import Joints as Joints
 from skills.demonstration.motion import Motion as Motion
 from skills.demonstration.motion import Signal as Signal
 from skills.demonstration.motion import equal_samples as equal_samples
+from skills.demonstration.motion import recorded_events as recorded_events
 from skills.demonstration.motion import recorded_joints as recorded_joints
 from skills.demonstration.motion import recorded_motion as recorded_motion
 from skills.demonstration.motion import recorded_signal as recorded_signal
@@ -462,7 +463,8 @@ def preference(motion: Motion) -> tuple[int, str]:
         A key to sort by, the preferred one first: rank of the topic, and its name.
     """
     known = [f"/{motion.arm}/local/measured_cp", f"/{motion.arm}/measured_cp"]
-    return (known.index(motion.topic) if motion.topic in known else len(known), motion.topic)
+    rank = known.index(motion.topic) if motion.topic in known else len(known)
+    return (0 if motion.topic.endswith("/position_cartesian_local_current") else rank, motion.topic)
 
 
 def _listed(topics: tuple[Topic, ...]) -> str:

@@ -13,14 +13,17 @@ from typing import BinaryIO
 from skills.demonstration.recording import Recording
 from skills.errors import BadSettings, MixedFrames, UnknownFormat, UnreadableRecording
 from skills.formats import archive
+from skills.formats.archive import check_pointer
 from skills.formats.bag_folder import read_one, read_zip
 from skills.formats.bag_writer import write_bag, write_mcap
 from skills.formats.cells import Decimals, has_separator, header_of, open_text
 from skills.formats.columns import BASE
+from skills.formats.dialects import UTF16, plain_table
 from skills.formats.ee_csv import is_header, read_ee_csv
 from skills.formats.extract import is_extract, read_extract
 from skills.formats.jigsaws import looks_like_kinematics, read_jigsaws
 from skills.formats.mcap import MAGIC
+from skills.formats.pace import check_pace
 from skills.formats.rosbag import DB3_MAGIC, ROS1_MAGIC, read_rosbag
 from skills.formats.tables import ReadingOptions, read_table
 from skills.remedies import Action, Remedy
@@ -41,6 +44,7 @@ _OTHERS = (
         "zstd (a bag compressed as a file); unpack it with `zstd -d`, or send the bag folder as a zip",
     ),
     (b"\x89HDF", "HDF5; export a table"),
+    (b"\x93NUMPY", "an array of NumPy; write a table, with numpy.savetxt and a header of names"),
     (_PARQUET, "Parquet, a part of a LeRobot dataset; send an episode with its meta/info.json, as a zip"),
 )
 
@@ -74,11 +78,12 @@ class FileFormat:
 
 def _read_columns(file: BinaryIO, options: ReadingOptions) -> Recording:
     """Read a table with a header of names: an ee_csv, unless the caller maps its columns, or of one arm."""
-    with open_text(file) as text:
-        names, _ = header_of(text)
-    file.seek(0)
-    read = read_ee_csv if not options.column and is_header(names) else read_table
-    return read(file, options)
+    with plain_table(file) as plain:
+        with open_text(plain) as text:
+            names, _ = header_of(text)
+        plain.seek(0)
+        read = read_ee_csv if not options.column and is_header(names) else read_table
+        return read(plain, options)
 
 
 # A new format is one more entry here; the first that fits is taken.
@@ -144,6 +149,7 @@ def read_recording(
         if field.name not in ("frame", "untimed") and getattr(options, field.name) != field.default:
             raise BadSettings(f"This is {found.name}, which has its own stamps, columns and arms; omit {field.name}.")
     recording = found.read(file, options)
+    check_pace(recording, options)
     own_bases = recording.format == "lerobot" and frame == BASE  # of each arm: PSM1_base, PSM2_base
     return recording if found.is_stated or own_bases else _in_frame(recording, frame)
 
@@ -174,9 +180,15 @@ def _format_of_text(head: bytes) -> FileFormat:
         if head.startswith(magic):
             remedies = [Remedy(Action.CUT_EPISODE)] if magic == _PARQUET else []
             raise UnknownFormat(f"This is {name}. {_READ}", *remedies)
+    check_pointer(head)
     try:
-        text = codecs.getincrementaldecoder("utf-8-sig")().decode(head)
+        text = codecs.getincrementaldecoder("utf-16" if head.startswith(UTF16) else "utf-8-sig")().decode(head)
     except UnicodeDecodeError:
+        if b"\0" not in head and has_separator(head.split(b"\n", 1)[0].decode("latin-1")):
+            raise UnknownFormat(
+                "The table is text, and not in UTF-8: spreadsheets write Windows-1252 as well. Save it as UTF-8, or "
+                "convert it: iconv -f WINDOWS-1252 -t UTF-8 TABLE.csv > UTF8.csv"
+            ) from None
         raise UnknownFormat(f"The content is neither a recording nor UTF-8 text. {_READ}") from None
     # Markup, JSON and binary data are refused here: the table reader would only complain about columns.
     is_plain = "\0" not in text and text.lstrip()[:1] not in ("<", "{", "[")

@@ -44,6 +44,22 @@ def refusing(what: str, advice: str) -> Iterator[None]:
         raise UnreadableRecording(f"{what} is truncated or corrupt. {advice}") from error
 
 
+HEAD_BYTES = 100  # of a file, in which a pointer of Git LFS is recognised
+_POINTER = b"version https://git-lfs.github.com/spec/"
+
+
+def check_pointer(head: bytes) -> None:
+    """Refuse the text that Git stores in place of a large file.
+
+    Raises:
+        UnreadableRecording: A file with this head is such a pointer.
+    """
+    if head.startswith(_POINTER):
+        raise UnreadableRecording(
+            "A file is a pointer of Git LFS, and not the recording itself: get that with `git lfs pull`, and send it."
+        )
+
+
 MAGIC = b"PK\x03\x04"
 MEMBERS = 2000  # a session of either recorder has a few dozen, and all of JIGSAWS 300
 LIST_BYTES = 1 << 20  # size of the member list of 2000 members with long names
@@ -83,8 +99,8 @@ class Archive:
         """Return the claimed unpacked size of a member in bytes; the real one is never larger."""
         return self._infos[name].file_size
 
-    def text(self, name: str) -> str:
-        """Return a short member as text.
+    def text(self, name: str, errors: str = "strict") -> str:
+        """Return a short member as text; `errors` says what becomes of bytes that are not UTF-8.
 
         Raises:
             UnreadableRecording: Damaged, longer than `TEXT_BYTES`, or not UTF-8.
@@ -94,7 +110,7 @@ class Archive:
         with io.BytesIO() as out:
             self._copy(name, out)
             try:
-                return out.getvalue().decode("utf-8-sig")
+                return out.getvalue().decode("utf-8-sig", errors)
             except UnicodeDecodeError as error:
                 raise UnreadableRecording(f"{shown(name)} in the archive is not UTF-8 text.") from error
 
@@ -130,6 +146,8 @@ class Archive:
         if size != info.file_size:
             raise UnreadableRecording(f"{shown(name)} in the archive is truncated. Send it again.")
         self._left -= size
+        out.seek(0)
+        check_pointer(out.read(len(_POINTER)))
 
 
 def pack(members: Mapping[str, IO[bytes]], out: IO[bytes]) -> None:

@@ -5,11 +5,11 @@ dataset (see `lerobot`), or one JIGSAWS trial.
 
     session/
         rosbag_1/metadata.yaml     the bag's files in order, and their numbers of messages
-        rosbag_1/rosbag_1_0.mcap   one file or several; also .mcap.zstd, .db3, or .bag of ROS 1
+        rosbag_1/rosbag_1_0.mcap   one file or several; also .mcap.zstd, .db3 (with its -wal), or .bag of ROS 1
         *.json                     the tags of the recorders (see `tags`)
         *.mp4 and others           ignored
 
-The bag is in one folder, anywhere in the archive. A bag in several files is joined topic by topic, in order of time.
+The bag is in one folder, anywhere in the archive. The messages of a bag in several files are merged by their log time.
 If there is a `metadata.yaml`, it must name exactly these files and count exactly these messages.
 
 """
@@ -27,15 +27,15 @@ import yaml
 import zstandard
 
 from skills.demonstration.recording import Format, Recording, Topic
-from skills.errors import NoUsableTopic, UnknownFormat, UnreadableRecording
+from skills.errors import UnknownFormat, UnreadableRecording
 from skills.formats import jigsaws
 from skills.formats.archive import Archive, refusing, shown
-from skills.formats.join import in_time, join
 from skills.formats.lerobot import is_shadow, root_of
 from skills.formats.lerobot.episode import read_episode
 from skills.formats.mcap import NeedsRosbags, read_mcap
+from skills.formats.mcap.cdr import UNPACK
 from skills.formats.rosbag import Suffix, read_rosbag
-from skills.formats.tags import TAGS_BYTES, read_labels
+from skills.formats.tags import TAGS_BYTES, in_time, read_labels
 from skills.remedies import Action, Remedy
 
 FILES = 1000
@@ -45,6 +45,7 @@ METADATA_PARTS, METADATA_DEPTH = 100_000, 20  # events of the parser; of 60 topi
 TEXTS = 10  # for one trial: its kinematics, a transcription, the meta files, a README
 UNZSTD_BYTES = 4 << 30
 SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".bag")
+LOGS = ("-wal", "-journal")  # of a database that was not closed, beside it
 
 _DIRECTIVE = re.compile("(?:^|[\r\n\x85\u2028\u2029])%")
 
@@ -70,7 +71,7 @@ def read_zip(file: BinaryIO, frame: str | None = None) -> Recording:
     Raises:
         UnknownFormat: It contains none of them.
         UnreadableRecording: The archive is damaged or dangerous, the bag incomplete, or a part of it unreadable.
-        NoUsableTopic: No topic of the bag, or of a part of it, has the pose of a PSM.
+        NoUsableTopic: No topic of the bag has the pose of a PSM.
         BadRecording: As for the files in it.
     """
     archive = Archive(file)
@@ -90,7 +91,8 @@ def read_zip(file: BinaryIO, frame: str | None = None) -> Recording:
 
 def suffix_of(name: str) -> str:
     """Return the suffix that marks a file as part of a bag; "" if it is not."""
-    return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), "")
+    lower = name.lower()
+    return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if lower.endswith(suffix)), "")
 
 
 def read_metadata(text: str) -> Metadata:
@@ -112,10 +114,13 @@ def read_metadata(text: str) -> Metadata:
             counts[name] += int(messages[:18])  # as many digits as 64 bits hold
         if not files:
             raise ValueError("no files")
+        mode = bag.get("compression_mode", "")
     except (yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError) as error:
         raise UnreadableRecording(
             f"{METADATA} is not the metadata of a bag. Remove it, or write it with `ros2 bag reindex`."
         ) from error
+    if str(mode).upper() == "MESSAGE":
+        raise UnreadableRecording(f"The messages of the bag are compressed one by one (compression_mode). {UNPACK}")
     return Metadata(files, dict(counts))
 
 
@@ -218,35 +223,49 @@ def _read_bag(archive: Archive, names: list[str], bag: list[str]) -> Recording:
         if suffixes[0].startswith(".mcap"):
             recording = _read_mcaps(archive, ordered)
         else:
-            recording = read_rosbag([files.enter_context(archive.unpacked(name)) for name in ordered], suffix)
+            unpacked = [files.enter_context(archive.unpacked(name)) for name in ordered]
+            logs = {
+                number: (beside, files.enter_context(archive.unpacked(name + beside)))
+                for number, name in enumerate(ordered)
+                for beside in LOGS
+                if name + beside in names and archive.size(name + beside)
+            }
+            recording = read_rosbag(unpacked, suffix, logs=logs, counted=metadata is not None)
     if metadata is not None:
         check_counts(metadata, recording.topics)
-    labels = read_labels(dict(_tags(archive, names)))
+    labels, left_aside = read_labels(dict(_tags(archive, names)))
     kind: Format = "rosbag1" if suffix == ".bag" else "rosbag2"
     # "full", because a zip archive has a checksum (CRC-32) of every file in it
-    return replace(recording, format=kind, integrity="full", labels=in_time((*recording.labels, *labels)))
+    return replace(
+        recording,
+        format=kind,
+        integrity="full",
+        labels=in_time((*recording.labels, *labels)),
+        left_out=(*recording.left_out, *left_aside.items()),
+    )
 
 
 def _read_mcaps(archive: Archive, names: list[str]) -> Recording:
-    """Read the parts one after the other, so that only one at a time is unpacked."""
-    parts = []
+    """Read the parts one after the other, so that only one at a time is unpacked, unless rosbags needs them all."""
+    first, *others = names
+    with _plain(archive, first) as file:
+        try:
+            return read_mcap(file, others=_each(archive, others))
+        except NeedsRosbags:
+            with ExitStack() as files:
+                return read_rosbag([files.enter_context(_plain(archive, name)) for name in names], ".mcap")
+
+
+def _each(archive: Archive, names: Iterable[str]) -> Iterator[BinaryIO]:
     for name in names:
         with _plain(archive, name) as file:
-            try:
-                parts.append(read_one(file))
-            except NoUsableTopic as error:
-                if len(names) == 1:
-                    raise
-                raise NoUsableTopic(
-                    f"{shown(name)}, a part of the bag: {error.message}", *error.remedies, Remedy(Action.JOIN_BAG)
-                ) from error
-    return join(sorted(parts, key=lambda part: part.origin_ns))  # without metadata, names do not give the order
+            yield file
 
 
 @contextmanager
 def _plain(archive: Archive, name: str) -> Iterator[BinaryIO]:
     with archive.unpacked(name) as file:
-        if not name.endswith(".zstd"):
+        if not suffix_of(name).endswith(".zstd"):
             yield file
             return
         with TemporaryFile() as out:
@@ -264,7 +283,7 @@ def _tags(archive: Archive, names: list[str]) -> Iterator[tuple[str, str]]:
     for name in names:
         if name.lower().endswith(".json") and archive.size(name) <= TAGS_BYTES and archive.size(name) <= left:
             left -= archive.size(name)
-            yield name, archive.text(name)
+            yield name, archive.text(name, errors="replace")
 
 
 def _read_trial(archive: Archive, names: list[str]) -> Recording:

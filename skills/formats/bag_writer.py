@@ -54,12 +54,13 @@ DEFINITIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One serialised message: log time, topic, type and bytes."""
+    """One serialised message: log time, topic, type and bytes, and the name of its publisher, if it is known."""
 
     log_ns: int
     topic: str
     type: str
     data: bytes
+    publisher: str = ""
 
 
 def pose(topic: str, stamp_ns: int, frame: str, place_m: Sequence[float], turn_xyzw: Sequence[float]) -> Message:
@@ -191,17 +192,17 @@ def write_messages(
     writer, written = Writer(file), Written()
     writer.start(profile="ros2", library="suture-skills")
     schemas: dict[str, int] = {}
-    channels: dict[tuple[str, str], int] = {}
+    channels: dict[tuple[str, str, str], int] = {}
     if notes:
         writer.add_metadata(NOTES, dict(notes))
     for message in said:
-        key = (message.topic, message.type)
+        key = (message.topic, message.type, message.publisher)
         if message.type not in schemas:
             definition = definitions[message.type].encode()
             schemas[message.type] = writer.register_schema(message.type, "ros2msg", definition)
         if key not in channels:
-            profiles = {"offered_qos_profiles": "[]"}
-            channels[key] = writer.register_channel(message.topic, "cdr", schemas[message.type], profiles)
+            about = {"offered_qos_profiles": "[]"} | ({"callerid": message.publisher} if message.publisher else {})
+            channels[key] = writer.register_channel(message.topic, "cdr", schemas[message.type], about)
         writer.add_message(channels[key], message.log_ns, message.data, message.log_ns, written.count(message))
     writer.finish()  # type: ignore[no-untyped-call]
     return written

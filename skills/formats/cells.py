@@ -16,8 +16,9 @@ import os
 import re
 from array import array
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from decimal import Decimal
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, TextIO
 
@@ -44,6 +45,7 @@ _QUOTED = re.compile('"[^"]*"')
 _NUMPY = re.compile(r"np\.float64\(([^(),;\t\n]*)\)")
 _NUMPY_BYTES = re.compile(_NUMPY.pattern.encode())
 _DECIMAL = r"^-?[0-9]{1,19}(\.[0-9]{0,9})?$"
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?\d*\s*(Z|[+-]\d\d:?\d\d)?")
 _FIRST_ROW = 2  # the header is row 1
 
 
@@ -223,10 +225,20 @@ def read_numbers(text: TextIO, layout: TableLayout) -> ParsedNumbers:
         next(_lines(text, 1))  # the header
         numbers = _any_numbers(text, layout)
     _check_finite(layout, numbers.groups)
+    if layout.time is not None and numbers.stamps_ns is not None and _mostly_repeated(numbers.stamps_ns):
+        text.seek(0)
+        next(_lines(text, 1))  # the header
+        row = next(csv_rows(text, first_line=_FIRST_ROW, separator=layout.separator))
+        _check_digits(layout.names, layout.time[0], row, _FIRST_ROW)
     if layout.time is not None:
         column, unit = layout.time
         _check_early(layout.names[column], unit, numbers.groups[list(layout.groups).index([column])][:, 0])
     return numbers
+
+
+def _mostly_repeated(stamps_ns: Ints) -> bool:
+    """Return whether more than half of the stamps repeat the one before."""
+    return len(stamps_ns) > 1 and bool(2 * np.count_nonzero(stamps_ns[1:] == stamps_ns[:-1]) > len(stamps_ns))
 
 
 def load_arrow() -> None:
@@ -380,6 +392,9 @@ def _any_numbers(text: TextIO, layout: TableLayout) -> ParsedNumbers:
             line, found = blank_line or line, 0 if blank_line else len(row)
             raise UnreadableRecording(f"Row {line} has {found} cells, the header {len(names)}. Export the table again.")
         picked = [row[k] for k in used]
+        if time is not None and (date := _ISO.fullmatch(picked[used.index(time[0])].strip())):
+            with suppress(ValueError):  # such as 30 February, which is refused as no number below
+                picked[used.index(time[0])] = _since_1970(date, NS_PER[time[1]])
         if decimal == "comma":
             picked = _with_points(names, used, picked, line)
         try:
@@ -446,6 +461,35 @@ def _check_finite(layout: TableLayout, found: Sequence[Floats]) -> None:
         line, column = min(wrong)
         name = layout.names[column]
         raise NotFinite(f"Row {line}, column {name}: NaN or infinity; cut the row.", row=line, column=name)
+
+
+def _since_1970(date: re.Match[str], ns_per_unit: int) -> str:
+    """Return a date of ISO 8601 in a unit of time since 1970, exactly; without an offset it is in UTC.
+
+    Raises:
+        ValueError: There is no such date.
+    """
+    whole, part, zone = date.groups()
+    moment = datetime.fromisoformat(whole + (zone or "+00:00"))
+    since_ns = int(moment.timestamp()) * 1_000_000_000 + int((part or "").ljust(9, "0")[:9])
+    return f"{Decimal(since_ns) / ns_per_unit:f}"
+
+
+def _check_digits(names: Sequence[str], column: int, cells: list[str], line: int) -> None:
+    """Refuse times that lost their digits, such as 1.76E+09, because they would repeat.
+
+    Raises:
+        UnreadableRecording: A time of ten digits or more has fewer, and an exponent.
+    """
+    cell = cells[column].strip()
+    mantissa, mark, exponent = cell.lower().partition("e")
+    if mark and is_number(cell) and abs(float(exponent)) > sum(letter.isdigit() for letter in mantissa) - 1 >= 0:
+        raise UnreadableRecording(
+            f"Row {line}, column {names[column]}: {cell[:40]!r} has lost its last digits, in a spreadsheet or as a "
+            "float. Export the times with all digits, as whole numbers or as text.",
+            row=line,
+            column=names[column],
+        )
 
 
 def _exact_ns(cell: str, ns_per_unit: int) -> int:

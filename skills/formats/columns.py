@@ -109,7 +109,7 @@ def check_joints(topic: str, joints: Floats) -> None:
         NotMetres: An insertion beyond 1 m, or an angle beyond `_JOINT_RAD`.
     """
     limits = np.where(np.array(UNITS) == "mm", COORDINATE_LIMIT_MM, _JOINT_RAD)
-    wrong = np.abs(joints) > limits
+    wrong = np.abs(joints[:, : len(limits)]) > limits[: joints.shape[1]]  # a jaw may follow them
     if wrong.any():
         row, joint = np.argwhere(wrong)[0].tolist()
         raise NotMetres(
@@ -177,15 +177,20 @@ def check_outside(motion: Motion) -> None:
         )
 
 
-def quaternion_of_rpy(rpy_rad: Floats) -> Floats:
+def quaternion_of_rpy(topic: str, rpy_rad: Floats) -> Floats:
     """Return the unit quaternions x, y, z, w of R = Rz(yaw) Ry(pitch) Rx(roll).
 
     Args:
+        topic: The source, for the message.
         rpy_rad: Roll, pitch, yaw about the fixed axes x, y, z, shape (T, 3).
 
     Returns:
         Shape (T, 4).
+
+    Raises:
+        NotAQuaternion: An angle is more than a whole turn, so its unit is another.
     """
+    _check_turn(topic, np.abs(rpy_rad).max(axis=1), "roll, pitch and yaw", "roll")
     (cr, cp, cy), (sr, sp, sy) = cos(rpy_rad.T / 2), sin(rpy_rad.T / 2)
     x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
     z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
@@ -207,14 +212,19 @@ def quaternion_of_vector(topic: str, vector_rad: Floats) -> Floats:
     """
     with np.errstate(over="ignore"):
         angle = np.linalg.norm(vector_rad, axis=1)
-    if not (angle <= _TURN_RAD).all():
-        row = int(np.argmin(angle <= _TURN_RAD))
+    _check_turn(topic, angle, "the rotation vector", "rx")
+    return of_vector(vector_rad)
+
+
+def _check_turn(topic: str, angle_rad: Floats, what: str, name: str) -> None:
+    """Refuse angles, shape (T,), of more than a turn; NaN is refused as well."""
+    if not (angle_rad <= _TURN_RAD).all():
+        row = int(np.argmin(angle_rad <= _TURN_RAD))
         raise NotAQuaternion(
-            f"{topic}: the rotation vector of sample {row} has the length {angle[row]:g} rad, more than a turn; name "
-            "its columns with their unit, rx_rad or rx_deg.",
+            f"{topic}: {what} of sample {row} have up to {angle_rad[row]:g} rad, more than a turn. Are they in "
+            f"degrees? Name the columns with their unit, {name}_rad or {name}_deg.",
             sample=row,
         )
-    return of_vector(vector_rad)
 
 
 def setpoints_in(

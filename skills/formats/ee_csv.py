@@ -51,7 +51,6 @@ from skills.formats.tables import (
     POSITION,
     QUATERNION,
     ReadingOptions,
-    check_steps,
     check_time,
     stamps_of,
 )
@@ -135,8 +134,6 @@ def _read(
     found = iter(numbers.groups)
     if time is not None:
         _check_whole(next(found))
-        assert numbers.stamps_ns is not None
-        check_steps(TIME, "ns", numbers.stamps_ns)
     stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, options)
     stamps_ns.setflags(write=False)  # so that all streams share it
     values = {one: tuple(next(found) for _ in parts) for one, parts in apart.items()}

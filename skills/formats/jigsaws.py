@@ -32,7 +32,7 @@ import numpy as np
 
 from skills.arithmetic import product
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Label, Motion, Recording, Signal, Topic, recorded_motion
+from skills.demonstration.recording import Label, Motion, Recording, Topic, recorded_motion, recorded_signal
 from skills.errors import NotAQuaternion, NotFinite, UnreadableRecording
 from skills.formats.cells import is_number
 from skills.kinematics import nearest_quaternions
@@ -130,7 +130,7 @@ def read_jigsaws(file: BinaryIO, transcription: str = "", rated: RatedTrial | No
     stamps_ns = np.rint(np.arange(len(table)) * (1e9 / RATE_HZ)).astype(np.int64)
     motions = {arm: _motion(arm, table, stamps_ns, first) for arm, first in _ARMS.items()}
     _check_sides(table)
-    grippers = {arm: Signal(stamps_ns, table[:, first + 18], _columns(first)) for arm, first in _ARMS.items()}
+    grippers = {arm: recorded_signal(stamps_ns, table[:, first + 18], _columns(first)) for arm, first in _ARMS.items()}
     return Recording(
         format="jigsaws",
         integrity="none",

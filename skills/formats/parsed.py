@@ -116,7 +116,9 @@ def _setpoints(recording: Recording) -> list[described.Setpoints]:
 
 
 def _dropped(recording: Recording) -> list[described.Dropped]:
-    signals = [signal for _, signal in (*recording.jaws, *recording.grippers, *recording.jaw_setpoints)]
+    signals = [
+        signal for _, signal in (*recording.jaws, *recording.grippers, *recording.jaw_setpoints, *recording.pedals)
+    ]
     streams: list[Motion | Joints | Signal]
     streams = [*recording.motions, *recording.joints, *recording.masters, *recording.setpoints, *signals]
     return [described.Dropped(one.topic, one.backward_stamps) for one in streams if one.backward_stamps]

@@ -180,7 +180,7 @@ def get_ready() -> None:
     load_arrow()
     for folder in cache_folders():
         check_cache_folder(folder)
-    stamps_ns, tip_mm = np.array([0, 1]), np.zeros((2, 3))
+    stamps_ns, tip_mm = np.array([0, 10_000_000]), np.zeros((2, 3))
     motion = Motion("PSM1", "/PSM1/measured_cp", "ECM", stamps_ns, tip_mm, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
     data = write_mcap(Recording("mcap", "full", (motion,)))
     make_ready(lambda: parse_recording(BytesIO(data)))

@@ -17,7 +17,7 @@ opens before its first query, and limits:
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -62,6 +62,8 @@ def guard(connection: apsw.Connection) -> None:
         UnreadableRecording: It contains anything else, or is not a database.
     """
     size = Path(connection.filename).stat().st_size
+    if not connection.readonly("main"):
+        connection.pragma("locking_mode", "exclusive")  # so that a log beside it needs no shared memory
     connection.config(apsw.SQLITE_DBCONFIG_ENABLE_VIEW, 0)
     connection.config(apsw.SQLITE_DBCONFIG_ENABLE_TRIGGER, 0)
     connection.config(apsw.SQLITE_DBCONFIG_TRUSTED_SCHEMA, 0)
@@ -137,6 +139,7 @@ def _allowed(action: int, one: str | None, other: str | None, _schema: str | Non
 
 
 ROS1_MAGIC = b"#ROSBAG V"
+HEADER_BYTES = 4096  # of a bag of ROS 1: its first record
 DB3_MAGIC = b"SQLite format 3\0"
 
 Suffix = Literal[".bag", ".db3", ".mcap"]
@@ -148,19 +151,53 @@ _ROS2 = get_typestore(Stores.ROS2_JAZZY)
 guard_connections()
 
 
-def read_rosbag(files: Sequence[BinaryIO], suffix: Suffix, integrity: Integrity = "none") -> Recording:
+def is_in_wal_mode(file: BinaryIO) -> bool:
+    """Return whether a file is an SQLite database whose last part may be in a write-ahead log beside it."""
+    file.seek(0)
+    head = file.read(20)
+    return head.startswith(DB3_MAGIC) and head[18:] == b"\2\2"  # the versions of writers and readers (SQLite's format)
+
+
+def merge_log(path: Path) -> None:
+    """Move the write-ahead log or the journal beside a copy of a database into it, as SQLite does.
+
+    Raises:
+        UnreadableRecording: It contains anything but a rosbag2, or the log is damaged.
+    """
+    has_log = Path(f"{path}-wal").is_file()
+    with refusing(_NAMES[".db3"], "Copy the folder of the bag again, with its -wal."):
+        connection = apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READWRITE)
+        connection.authorizer = None  # ours alone are the statements here
+        frames, _ = connection.wal_checkpoint(mode=apsw.SQLITE_CHECKPOINT_FULL)
+        if (has_log and frames <= 0) or connection.pragma("journal_mode", "delete") != "delete":
+            raise UnreadableRecording(
+                "The write-ahead log (-wal) beside the SQLite bag (.db3) is damaged or of another. Copy both again."
+            )
+        connection.close()
+
+
+def read_rosbag(
+    files: Sequence[BinaryIO],
+    suffix: Suffix,
+    integrity: Integrity = "none",
+    *,
+    logs: Mapping[int, tuple[str, BinaryIO]] | None = None,
+    counted: bool = False,
+) -> Recording:
     """Read a dVRK recording through rosbags.
 
     Args:
         files: The bag, or its parts in order; each is read from its beginning.
         suffix: Their format.
         integrity: The integrity of their checksums, where it is known.
+        logs: The write-ahead logs or journals beside databases, with their suffixes, by the indices of the files.
+        counted: Whether the caller compares the numbers of messages with a metadata.yaml.
 
     Returns:
         The recording, in millimetres.
 
     Raises:
-        UnreadableRecording: Truncated, corrupt, or not in the format of the suffix.
+        UnreadableRecording: Truncated, corrupt, not in the format of the suffix, or a part of it may be missing.
         NoUsableTopic: No topic has the pose of a PSM.
         MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
     """
@@ -168,10 +205,33 @@ def read_rosbag(files: Sequence[BinaryIO], suffix: Suffix, integrity: Integrity 
         with ExitStack() as opened:
             with tempfile.TemporaryDirectory() as folder:
                 paths = [_copied(file, Path(folder) / f"part{number}{suffix}") for number, file in enumerate(files)]
+                for number, (beside, log) in (logs or {}).items():
+                    _copied(log, Path(f"{paths[number]}{beside}"))
+                    merge_log(paths[number])
+                if not counted:
+                    _check_no_log_is_missing(paths)
                 reader = opened.enter_context(_reading(paths))  # open files stay readable without their folder
             here = _convert(reader, out)
         out.seek(0)
-        return replace(read_mcap(out), format=_FORMATS[suffix], integrity=integrity, topics=here)
+        read = read_mcap(out)
+        left_out = tuple(sorted((dict(topics.not_understood(here)) | dict(read.left_out)).items()))
+        return replace(read, format=_FORMATS[suffix], integrity=integrity, topics=here, left_out=left_out)
+
+
+def _check_no_log_is_missing(paths: Sequence[Path]) -> None:
+    """Refuse databases whose last messages may be in a log that is not here.
+
+    Raises:
+        UnreadableRecording: One is in WAL mode.
+    """
+    for path in paths:
+        with path.open("rb") as file:
+            if is_in_wal_mode(file):
+                raise UnreadableRecording(
+                    "The SQLite bag (.db3) is in WAL mode: its last messages may be in the file with the suffix -wal "
+                    "that was beside it and is not here. Send the whole folder as a zip. If the recorder closed the "
+                    "bag and left no such file, say so to SQLite: sqlite3 BAG.db3 'PRAGMA journal_mode=DELETE'"
+                )
 
 
 def convert(paths: Sequence[Path], out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
@@ -249,8 +309,25 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
 def _reading(paths: Sequence[Path]) -> Iterator[AnyReader]:
     advice = "Copy it again, or convert it with `ros2 bag convert` or `rosbags-convert`."
     what = f"The {_NAMES.get(paths[0].suffix, 'bag')}"
+    for path in paths:
+        with path.open("rb") as file:
+            _check_indexed(file.read(HEADER_BYTES))
     with refusing(what, advice), AnyReader(paths, default_typestore=_ROS2) as reader:
         yield reader
+
+
+def _check_indexed(head: bytes) -> None:
+    """Refuse a bag of ROS 1 whose header has no place of an index, as while it is recorded (Bag format 2.0).
+
+    Raises:
+        UnreadableRecording: It was not closed.
+    """
+    at = head.find(b"index_pos=") if head.startswith(ROS1_MAGIC) else -1
+    if at >= 0 and head[at + 10 : at + 18] == bytes(8):
+        raise UnreadableRecording(
+            "The ROS 1 bag has no index: its recorder was ended before it closed the bag (a .bag.active). Index it "
+            "with `rosbag reindex FILE`, and send the result."
+        )
 
 
 def _convert(reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
@@ -275,8 +352,8 @@ def _topics(reader: AnyReader) -> tuple[Topic, ...]:
 def _messages(reader: AnyReader, used: Sequence[Any]) -> Iterator[Message]:
     """Yield the messages of some connections as CDR."""
     for connection, log_ns, data in reader.messages(connections=used):
-        kind = connection.msgtype
-        yield Message(log_ns, connection.topic, kind, data if reader.is2 else _cdr(data, kind))
+        kind, publisher = connection.msgtype, getattr(connection.ext, "callerid", None) or ""
+        yield Message(log_ns, connection.topic, kind, data if reader.is2 else _cdr(data, kind), publisher)
 
 
 def _cdr(data: bytes, kind: str) -> bytes:

@@ -33,6 +33,7 @@ from typing import BinaryIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
+from skills.demonstration.plausible import MOST_HZ
 from skills.demonstration.recording import (
     Column,
     Recording,
@@ -60,7 +61,6 @@ from skills.remedies import Action, Remedy, did_you_mean
 TOPIC = "table"
 DEFAULT_ARM = "PSM"
 NOT_ENDED = ("last row", "It has no line end: if the file was cut, its last number lacks digits.")
-_FASTEST_HZ = 100_000.0
 
 LENGTHS: Mapping[str, float] = {"m": 1000.0, "mm": 1.0}  # in mm
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": np.pi / 180}  # in rad
@@ -77,10 +77,18 @@ QUANTITIES: Mapping[str, Mapping[str, float]] = {
     "clutch": PLAIN,
     **{name: LENGTHS if unit == "mm" else ANGLES for name, unit in zip(JOINT_NAMES, UNITS, strict=True)},
 }
+# Ours: the greatest number of an orientation, of joints or of a jaw, if it is in radians. Smaller ones are no motion.
+_RADIANS: Mapping[tuple[str, ...], tuple[float, float]] = {
+    RPY: (0.5, np.pi),
+    ROTATION_VECTOR: (0.5, np.pi),
+    tuple(name for name in JOINT_NAMES if QUANTITIES[name] is ANGLES): (0.1, 4.6),
+    ("jaw",): (0.3, 1.6),
+}
 KNOWN = (
     "t_s (or t_ms, t_us, t_ns), x_m, y_m, z_m (or _mm), qx, qy, qz, qw, roll_rad, pitch_rad, yaw_rad, rx_rad, ry_rad, "
     "rz_rad, jaw_rad (or _deg), clutch, q1_rad, q2_rad, q3_m, q4_rad, q5_rad, q6_rad"
 )
+_INDICES = ("", "Unnamed: 0", "index")  # the first column of a table by pandas: the numbers of its rows
 _PAPER_NAMES = {
     "Rot R": "roll_rad",
     "Rot P": "pitch_rad",
@@ -121,8 +129,8 @@ class ReadingOptions:
     untimed: bool = False
 
     def __post_init__(self) -> None:
-        if self.rate_hz is not None and not 0 < self.rate_hz <= _FASTEST_HZ:
-            raise BadSettings(f"rate_hz is {self.rate_hz}; give samples per second, above 0 and up to {_FASTEST_HZ:g}.")
+        if self.rate_hz is not None and not 0 < self.rate_hz <= MOST_HZ:
+            raise BadSettings(f"rate_hz is {self.rate_hz}; give samples per second, above 0 and up to {MOST_HZ:g}.")
         if self.decimal not in ("point", "comma"):
             raise BadSettings(f"decimal is {self.decimal!r}; it is point or comma.")
         if self.instrument is not None:
@@ -182,12 +190,11 @@ def read_table(file: BinaryIO, reading: ReadingOptions | None = None) -> Recordi
     if not is_ended:
         cells.check_last_number(file, separator, options.decimal)
     stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, options)
-    if time is not None and time.unit != "s":
-        check_steps(names[time.index], time.unit, stamps_ns)
     columns = {
         name: scaled(found[:, 0], QUANTITIES[name][use.unit])
         for found, (name, use) in zip(numbers.groups, uses.items(), strict=True)
     }
+    _check_degrees(names, uses, columns)
     meant = {use.index: (quantity, use.unit) for quantity, use in uses.items()}
     listed = tuple(Column(name, *meant.get(index, ("", ""))) for index, name in enumerate(names))
     recording = _recording(_Table(columns, stamps_ns), options, listed)
@@ -251,7 +258,8 @@ def _uses(names: list[str], options: ReadingOptions) -> dict[str, _Use]:
             continue
         quantity, unit = _named(aliases.get(name, name))
         if not quantity or (not unit and QUANTITIES[quantity] is not PLAIN):
-            if not mapped and not (of_calibration and _OTHERS_OF_CALIBRATIONS.fullmatch(name)):
+            is_index = index == 0 and name in _INDICES  # it is listed as not used
+            if not mapped and not is_index and not (of_calibration and _OTHERS_OF_CALIBRATIONS.fullmatch(name)):
                 unknown.append(name)
         elif quantity in own:
             one, other = _full(quantity, own[quantity].unit), _full(quantity, unit)
@@ -410,27 +418,32 @@ def stamps_of(stamps_ns: Ints | None, count: int, options: ReadingOptions) -> In
     return even
 
 
-def check_steps(column: str, unit: str, stamps_ns: Ints) -> None:
-    """Refuse times that no recorder has: in another unit they would be plausible.
+def _check_degrees(names: Sequence[str], uses: Mapping[str, _Use], columns: Mapping[str, Floats]) -> None:
+    """Ask about degrees that stay within the numbers that radians have.
 
     Raises:
-        BadColumns: The median step between different stamps is shorter than at `_FASTEST_HZ`.
+        BadColumns: The greatest number of a group is within its limits in `_RADIANS`.
     """
-    steps_ns = np.diff(stamps_ns)
-    steps_ns = steps_ns[steps_ns > 0]
-    if len(steps_ns) and np.median(steps_ns) < 1e9 / _FASTEST_HZ:
-        raise BadColumns(
-            f"The times of the column {column} are {np.median(steps_ns):g} ns apart, read as {unit}; in which unit are "
-            "they? Name their column as t_s=NAME, t_ms=NAME, t_us=NAME or t_ns=NAME.",
-            column=column,
-        )
+    for group, (least, most) in _RADIANS.items():
+        read = {name: np.degrees(columns[name]) for name in group if name in uses and uses[name].unit == "deg"}
+        greatest = max((float(np.abs(values).max()) for values in read.values()), default=0.0)
+        if least <= greatest <= most:
+            name = next(iter(read))
+            first = names[uses[name].index][:80]
+            raise BadColumns(
+                f"The angles of {', '.join(read)} are at most {greatest:.3g}, read as degrees; radians have such "
+                f"numbers. Name the columns with the right unit, as in {name}_rad={first}; if they are degrees, give "
+                "them in radians.",
+                column=first,
+                greatest=greatest,
+            )
 
 
 def _rotation_xyzw(table: _Table) -> Floats | None:
     if QUATERNION[0] in table.columns:
         return table.stacked(QUATERNION)
     if RPY[0] in table.columns:
-        return quaternion_of_rpy(table.stacked(RPY))
+        return quaternion_of_rpy(TOPIC, table.stacked(RPY))
     return quaternion_of_vector(TOPIC, table.stacked(ROTATION_VECTOR)) if ROTATION_VECTOR[0] in table.columns else None
 
 

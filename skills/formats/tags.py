@@ -9,38 +9,47 @@ Two recorders write tags: jhu-dvrk/data_collection and jhu-dvrk/dvrk_data. Both 
 
 A sidecar is JSON too, with `timestamps_ns` or `frames` of `{"cpu_ts": ns}`; it belongs to the tags with the same
 `video_file`, or to those named like it with `_tags` appended. Stages without an end, and frames without a sidecar, have
-no time and are skipped; other JSON files are ignored.
+no time and are skipped; other JSON files are ignored, and those that are damaged or have comments are named.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import PurePosixPath
 from typing import Any
 
 from skills.demonstration.recording import Label
 from skills.errors import UnreadableRecording
 from skills.formats.archive import printable
-from skills.formats.join import in_time
 
 TAGS_BYTES = 32 << 20  # per JSON file: the frames of a day of video
 LABELS = 10_000
 
+_WORDS = ("stages", "timestamps_ns", "frames", "video_file", "cpu_ts")  # of tags and sidecars
 _NAME_LENGTH = 200
 _LATEST_FRAME = 10**12  # larger numbers are nanoseconds; this one is 17 minutes after midnight of 1 January 1970
 _LATEST_NS = 2**62  # in the year 2116; later stamps are taken for errors
 Json = dict[str, Any]  # of any form: the recorders have changed theirs, and other JSON lies beside it
 
 
-def read_labels(texts: Mapping[str, str]) -> tuple[Label, ...]:
-    """Return the stages in some JSON files, in order of time; duplicates are removed.
+def read_labels(texts: Mapping[str, str]) -> tuple[tuple[Label, ...], dict[str, str]]:
+    """Return the stages in some JSON files, in order of time and without duplicates, and the files left aside.
 
     Args:
         texts: Contents of the files, by file name.
 
+    Returns:
+        The stages; and files that are neither JSON nor tags, such as settings with comments, with the reason.
+
     Raises:
-        UnreadableRecording: A file is not JSON, has an invalid stage, or a stage that ends before it starts.
+        UnreadableRecording: A file of tags is not JSON, has an invalid stage, or a stage that ends before it starts.
     """
-    documents = {name: document for name, text in texts.items() if isinstance(document := _parsed(name, text), dict)}
+    left_aside, documents = dict[str, str](), dict[str, Json]()
+    for name, text in texts.items():
+        document = _parsed(name, text)
+        if document is None:
+            left_aside[_short(name)] = "left aside: it is neither valid JSON nor the tags of a recorder"
+        elif isinstance(document, dict):
+            documents[name] = document
     frames = dict(_sidecars(documents))
     labels: set[Label] = set()
     for name, document in documents.items():
@@ -49,13 +58,25 @@ def read_labels(texts: Mapping[str, str]) -> tuple[Label, ...]:
             raise UnreadableRecording(f"{_short(name)}: `stages` is not a list of at most {LABELS} stages.")
         stamps = _stamps_for(name, document, frames)
         labels.update(label for stage in stages if (label := _label(name, stage, stamps)) is not None)
-    return in_time(labels)
+    return in_time(labels), left_aside
+
+
+def in_time(labels: Iterable[Label]) -> tuple[Label, ...]:
+    """Return labels in order of time, without duplicates."""
+    return tuple(sorted(set(labels), key=lambda label: (label.start_ns, label.end_ns, label.name)))
 
 
 def _parsed(name: str, text: str) -> Any:
+    """Return a JSON document; None for a file that is none and has nothing of a recorder's tags.
+
+    Raises:
+        UnreadableRecording: It is a recorder's, and damaged.
+    """
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
+        if not name.endswith("tags.json") and not any(f'"{word}"' in text for word in _WORDS):
+            return None
         raise UnreadableRecording(f"{_short(name)} is not valid JSON ({type(error).__name__}); remove it.") from error
 
 

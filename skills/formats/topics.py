@@ -2,7 +2,8 @@
 
 dVRK 2.2 and later publish the tip as PoseStamped, earlier versions as TransformStamped; both in metres, with the time
 of measurement in the header. The topics follow the CRTK conventions (dVRK documentation, "Arms" and "Console"); they
-may be below any namespace, as in `/CRTK/psm2/measured_cp`.
+may be below any namespace, as in `/CRTK/psm2/measured_cp`. dVRK 1.x has other names: `position_cartesian_current`,
+`position_cartesian_local_current`, `state_joint_current`, `state_jaw_current` and `state_gripper_current`.
 
 Only measured motions are learnt from. Setpoints of a PSM's tip and jaw are read beside them, because a dataset may have
 them as its actions; they are never motions. Setpoints of joints (`setpoint_js`) are not read: known recorders take
@@ -12,6 +13,7 @@ like) are not used, nor are poses of other things (`T_b_w`, the base of an arm i
 
 import re
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -34,6 +36,15 @@ _MTM = re.compile(r"MTM[LR]?\d*", re.IGNORECASE)
 _PAIR = re.compile(r"MTM[LR]?\d*_PSM\d*", re.IGNORECASE)
 _COMMANDS = re.compile(r"setpoint|desired|goal|servo|move|T_b_w")
 _SETPOINTS = ("setpoint_cp", "position_cartesian_desired", "position_cartesian_local_desired")  # dVRK 2, and before
+_OLDER_NAMES = {  # of joint states in dVRK 1.x
+    "state_joint_current": "/measured_js",
+    "state_jaw_current": "/jaw/measured_js",
+    "state_jaw_desired": "/jaw/setpoint_js",
+    "state_gripper_current": "/gripper/measured_js",
+    "state_joint_desired": "/setpoint_js",
+}
+_OLDER = re.compile(rf"/({'|'.join(_OLDER_NAMES)})$")
+_POSES = frozenset(f"geometry_msgs/msg/{name}" for name in ("Pose", "Transform", "PoseWithCovarianceStamped"))
 _CONSOLE = ("clutch", "camera", "operator_present")
 
 
@@ -68,6 +79,8 @@ def meaning(topic: str, message_type: str) -> Meaning | None:
     """Return the meaning of a topic of this message type; None where it is not used here."""
     if message_type in (POSE, TRANSFORM):
         return _of_pose(topic)
+    if message_type == JOINT_STATE and (known := _OLDER.search(topic)):
+        topic = topic[: known.start()] + _OLDER_NAMES[known[1]]
     if message_type == JOINT_STATE and topic.endswith("/measured_js"):
         return _of_joints(topic)
     if message_type == JOINT_STATE and topic.endswith("/jaw/setpoint_js"):
@@ -97,6 +110,17 @@ def is_setpoint(topic: str, message_type: str) -> bool:
     """Return whether a topic carries setpoints of a PSM's tip or jaw; no recording is refused for them."""
     said = meaning(topic, message_type)
     return said is not None and said.kind in (TopicKind.SETPOINT, TopicKind.JAW_SETPOINT)
+
+
+def not_understood(counted: Iterable[Topic]) -> Iterator[tuple[str, str]]:
+    """Yield the topics with poses or joints of an arm that are neither read nor known as commands, with the reason."""
+    for one in counted:
+        message_type = one.type.replace("/", "/msg/") if one.type.count("/") == 1 else one.type
+        arm = _named(_PSM, one.name) or _named(_MTM, one.name)
+        of_kind = message_type in {POSE, TRANSFORM, JOINT_STATE} | _POSES
+        last = one.name.rsplit("/", 1)[-1]
+        if one.messages and of_kind and arm and not _COMMANDS.search(last) and meaning(one.name, message_type) is None:
+            yield one.name, f"not read: {last} of {message_type} is no topic of {arm} that is known"
 
 
 def counted(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:

@@ -13,6 +13,7 @@ Checksums of the original are verified while copying, and the copy has its own.
 """
 
 import json
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,7 +29,7 @@ from mcap.writer import Writer
 from skills.demonstration.recording import Label, Topic
 from skills.errors import BadInput, SkillsError, UnreadableRecording
 from skills.formats import bag_folder, rosbag
-from skills.formats.archive import pack
+from skills.formats.archive import HEAD_BYTES, check_pointer, pack
 from skills.formats.checksums import digest_of
 from skills.formats.jigsaws import trials
 from skills.formats.lerobot import INFO
@@ -66,11 +67,12 @@ def ignore(_: int) -> None:
 
 @dataclass(frozen=True)
 class Bag:
-    """A bag on this machine: its files in order, its metadata.yaml and its stages."""
+    """A bag on this machine: its files in order, its metadata.yaml, its stages, and JSON beside it that is not read."""
 
     files: tuple[Path, ...]
     metadata: bag_folder.Metadata | None = None
     labels: tuple[Label, ...] = ()
+    left_aside: tuple[str, ...] = ()
 
     @property
     def size_bytes(self) -> int:
@@ -111,11 +113,8 @@ def find_bag(path: Path) -> Bag:
     known = bag_folder.read_metadata(metadata.read_text(errors="replace")) if metadata.is_file() else None
     names = {file.name: file for file in files}
     ordered = bag_folder.in_order(sorted(names, key=_by_number), known) if known else sorted(names, key=_by_number)
-    return Bag(
-        files=tuple(names[name] for name in ordered),
-        metadata=known,
-        labels=_labels_in(path),
-    )
+    labels, left_aside = _labels_in(path)
+    return Bag(tuple(names[name] for name in ordered), known, labels, tuple(left_aside))
 
 
 @contextmanager
@@ -148,7 +147,7 @@ def _one_file(bag: Bag, folder: Path, progress: Progress) -> Path:
     """Return the bag as one file without pictures; the original file if it is one already."""
     if len(bag.files) == 1 and not _can_be_rewritten(bag.files[0]):
         return bag.files[0]
-    files = [_plain_file(file, folder) for file in bag.files]
+    files = [_plain_file(file, folder, counted=bag.metadata is not None) for file in bag.files]
     if len(files) == 1 and files[0] == bag.files[0]:
         topics = topics_of(files[0]) if files[0].suffix == ".mcap" else rosbag.topics_in(files)
         if not any(topic.type in PICTURES for topic in topics):
@@ -174,7 +173,8 @@ def _can_be_rewritten(file: Path) -> bool:
     with file.open("rb") as content:
         head = content.read(16)
     kinds = {".mcap": MAGIC, ".bag": rosbag.ROS1_MAGIC, ".db3": rosbag.DB3_MAGIC, ".zstd": b"\x28\xb5\x2f\xfd"}
-    return file.suffix in kinds and head.startswith(kinds[file.suffix])
+    suffix = file.suffix.lower()
+    return suffix in kinds and head.startswith(kinds[suffix])
 
 
 def _check(bag: Bag, topics: Sequence[Topic]) -> None:
@@ -182,33 +182,44 @@ def _check(bag: Bag, topics: Sequence[Topic]) -> None:
         bag_folder.check_counts(bag.metadata, topics)
 
 
-def _plain_file(file: Path, folder: Path) -> Path:
-    """Return a file, decompressed into the folder if rosbag2 compressed it."""
-    if file.suffix != ".zstd":
-        return file
-    plain = folder / file.stem
+def _plain_file(file: Path, folder: Path, *, counted: bool) -> Path:
+    """Return a file as rosbags and MCAP's library read it, or such a copy in the folder.
+
+    One that rosbag2 compressed is decompressed, a database is merged with its log, a suffix is in small letters. A
+    database in WAL mode without its log remains as it is, so that the service refuses it, unless its messages are
+    counted.
+    """
+    suffix = file.suffix.lower()
+    with file.open("rb") as content:
+        check_pointer(content.read(HEAD_BYTES))
+    if suffix != ".zstd":
+        logs = [log for log in (Path(f"{file}{beside}") for beside in bag_folder.LOGS) if log.is_file()]
+        with file.open("rb") as content:
+            is_merged = suffix == ".db3" and (bool(logs) or (counted and rosbag.is_in_wal_mode(content)))
+        if not is_merged and suffix == file.suffix:
+            return file
+        plain = folder / f"{file.stem}{suffix}"
+        for one in (file, *logs):
+            shutil.copyfile(one, f"{plain}{one.name.removeprefix(file.name)}")
+        if is_merged:
+            rosbag.merge_log(plain)
+        return plain
+    plain = folder / file.stem.lower()
     with file.open("rb") as packed, plain.open("wb") as out:
         bag_folder.unzstd(packed, out)
     return plain
 
 
-def _labels_in(folder: Path) -> tuple[Label, ...]:
-    """Read the stages from the JSON files in a session's folder.
+def _labels_in(folder: Path) -> tuple[tuple[Label, ...], dict[str, str]]:
+    """Read the stages, and the files left aside, from the JSON files in a session's folder.
 
     A file over `TAGS_BYTES` has the frames of a long video, and is skipped.
     """
     texts = {}
     for file in sorted(folder.rglob("*.json")):
         if file.is_file() and file.stat().st_size <= TAGS_BYTES:
-            texts[file.relative_to(folder).as_posix()] = _text(file)
+            texts[file.relative_to(folder).as_posix()] = file.read_text(encoding="utf-8-sig", errors="replace")
     return read_labels(texts)
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise UnreadableRecording(f"{file.name} is not UTF-8 text; remove it from the folder.") from error
 
 
 def _stages(labels: Sequence[Label]) -> bytes:

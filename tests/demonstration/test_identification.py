@@ -9,7 +9,7 @@ import pytest
 from skills.demonstration.hypotheses import HYPOTHESES, stated_instrument
 from skills.demonstration.identification import FEWEST_SAMPLES, identify
 from skills.errors import BadInput
-from skills.kinematics import JAW_TIP_MM, axes_of, forward, matrix_of
+from skills.kinematics import JAW_TIP_MM, POINTING_DOWN, axes_of, forward, inverse, matrix_of
 from tests.demonstration.arms import MISTAKES, REAL, Mistake, cut, drawn, real
 
 TWINS = ("400006", "420006")  # each on an arm of its own generation: equal lengths
@@ -226,3 +226,24 @@ def test_no_planted_mistake_is_silent(mistake: Mistake, count):
         verdicts[found.verdict] += 1
         assert found.verdict in FLAGGED, (seed, planted.truth, planted.stated, found)
     print(mistake.__name__, dict(verdicts))
+
+
+@pytest.mark.parametrize("fault", ["insertion", "frame", "none"])
+@pytest.mark.parametrize("extent_mm", [3.0, 12.0, 30.0])
+def test_a_motion_is_called_too_small_only_if_it_is(fault, extent_mm):
+    """An insertion that is off, or a frame that moved half-way, is the reason where the motion is not."""
+    at = np.arange(800) / 100
+    way = np.stack([np.sin(at), 0.4 * np.cos(0.8 * at), 0.3 * np.sin(at / 2)], axis=1)
+    tip = np.array([5.0, 45.0, -130.0]) + extent_mm * way
+    q = inverse(tip, POINTING_DOWN) + np.outer(np.sin(0.6 * at), [0, 0, 0, 0.2, 0.2, 0.1])
+    poses, turned = forward(q, "400006")
+    if fault == "insertion":
+        q[:, 2] += 4.0
+    elif fault == "frame":
+        poses[400:, 2] += 1.3
+    found = identify(q, poses, turned, in_base=False)
+    if fault == "none":
+        assert found.verdict == "identified" or "too small" in found.reason
+    else:
+        assert "too small" not in found.reason
+        assert found.verdict != "undetermined" or "the zero of a joint" in found.reason

@@ -236,5 +236,7 @@ def test_any_motion_gives_ordered_proposals_that_can_be_cut(seed, jaw, pedal, tu
 
 
 def test_a_stamp_years_away_costs_no_memory():
-    value = Motion("PSM2", "/t", "f", np.array([0, 10**7, 10**18]), np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
+    value = Motion(
+        "PSM2", "/t", "f", 10**16 + np.array([0, 10**7, 10**18]), np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    )
     propose_segments(Recording(format="csv", integrity="none", motions=(value,)), "PSM2")

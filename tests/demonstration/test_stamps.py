@@ -117,11 +117,11 @@ def test_nothing_wrong_hides_in_a_dropped_sample():
 def test_joints_and_jaws_keep_equal_stamps_and_drop_the_others(made):
     stamps = even(200)
     stamps[50], stamps[120] = stamps[49], stamps[119] - 1
-    signal = made(stamps, np.arange(200.0), "/PSM1/measured_js")
+    signal = made(stamps, np.arange(200.0) / 100, "/PSM1/measured_js")
     assert (signal.backward_stamps, len(signal.stamps_ns)) == (1, 199)
     stamps[[130, 140]] = stamps[[129, 139]] - 1
     with pytest.raises(BackwardStamps):
-        made(stamps, np.arange(200.0), "/PSM1/measured_js")
+        made(stamps, np.arange(200.0) / 100, "/PSM1/measured_js")
 
 
 def test_equal_samples_are_counted_and_not_dropped():

@@ -115,13 +115,13 @@ def costly_recordings() -> dict[str, bytes]:
 
 def costly_to_tell() -> dict[str, bytes]:
     """Return recordings that are read quickly, and in which the search for hand-offs is expensive."""
-    rows = (f"{k * 0.5},{k // 4 % 2 * 8},0,-100,{k % 2 * 0.5}\n" for k in range(30_000))
+    rows = (f"{k * 0.125},{k // 4 % 2 * 8},0,-100,{k % 2 * 0.5}\n" for k in range(30_000))
     at_ns = bags.START_NS
-    stages = [{"name": f"hand-off {k}", "start": at_ns + k, "end": at_ns + 1999 * 5 * 10**9} for k in range(9_000)]
-    tagged = {"b/b.mcap": slow(2000, 5.0), "b/b_tags.json": json.dumps({"stages": stages}).encode()}
+    stages = [{"name": f"hand-off {k}", "start": at_ns + k, "end": at_ns + 1999 * 10**8} for k in range(9_000)]
+    tagged = {"b/b.mcap": slow(2000, 0.1), "b/b_tags.json": json.dumps({"stages": stages}).encode()}
     return {
-        "a jaw that flickers for four hours": "".join(["t_s,x_mm,y_mm,z_mm,jaw_rad\n", *rows]).encode(),
-        "9,000 stages of three hours at once": zipped(tagged),
+        "a jaw that flickers for an hour": "".join(["t_s,x_mm,y_mm,z_mm,jaw_rad\n", *rows]).encode(),
+        "9,000 stages of three minutes at once": zipped(tagged),
     }
 
 

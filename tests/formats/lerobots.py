@@ -59,8 +59,9 @@ def joint_columns(names: Sequence[str]) -> tuple[dict[str, Any], dict[str, Seque
 
 
 def numbers(names: Sequence[str] | None, width: int, dtype: str = "float32") -> dict[str, Any]:
-    """Describe a feature of numbers."""
-    return {"dtype": dtype, "shape": [width], "names": None if names is None else list(names)}
+    """Describe a feature of numbers; names may be an object with lists of them, as some writers have it."""
+    listed = names if names is None or isinstance(names, dict) else list(names)
+    return {"dtype": dtype, "shape": [width], "names": listed}
 
 
 def text() -> dict[str, Any]:

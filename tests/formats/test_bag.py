@@ -12,6 +12,8 @@ from skills.errors import MixedFrames, NoUsableTopic, UnreadableRecording
 from skills.formats import bag_writer, read_recording, write_mcap
 from skills.formats.bag_folder import Metadata, read_metadata
 from skills.formats.bag_writer import messages_of, write_messages
+from skills.formats.parsed import parse
+from skills.formats.upload import find_bag, prepare_upload
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, assert_same, pose_bag, recording, sample_folder, straight
 from tests.formats.others import assert_all_the_same, folder_members, rosbag2, whole, zipped
 
@@ -173,10 +175,60 @@ def test_two_parts_in_two_frames_are_refused():
         read({"x_0.mcap": pose_bag(straight()), "x_1.mcap": pose_bag(later)})
 
 
-def test_a_part_without_an_arm_is_refused_with_what_to_do():
+def test_a_part_without_an_arm_is_a_part_as_any_other():
     clutch = written([bag_writer.joy("/console/clutch", START_NS, [1])])
-    with pytest.raises(NoUsableTopic, match=r"'x_1.mcap'.*Join the parts first"):
-        read({"x_0.mcap": pose_bag(straight()), "x_1.mcap": clutch})
+    assert read({"x_0.mcap": pose_bag(straight()), "x_1.mcap": clutch}).clutch.values.tolist() == [1.0]
+    with pytest.raises(NoUsableTopic):
+        read({"x_0.mcap": clutch, "x_1.mcap": clutch})
+
+
+def split(tmp_path, first, second):
+    """Return a recording in two files as read from a zip, and as the client joins the same folder."""
+    members = {"b/b_0.mcap": written(first), "b/b_1.mcap": written(second)}
+    for name, data in members.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    with prepare_upload(find_bag(tmp_path / "b")) as path, path.open("rb") as file:
+        return read(members), read_recording(file)
+
+
+@pytest.mark.parametrize("late_ms", [0, 20, 50, 80])
+def test_a_zip_and_a_folder_of_a_split_bag_say_the_same_wherever_its_messages_are(tmp_path, late_ms):
+    """Messages around the split are in the other part, as a recorder with a cache writes them."""
+    said, cut = messages_of(recording()), START_NS + 20 * STEP_NS
+    presses = [bag_writer.joy("/footpedals/coag", cut + k * STEP_NS, [k % 2]) for k in range(-9, 10, 3)]
+    rng = np.random.default_rng(late_ms)
+    late_ns = {id(one): int(rng.integers(-late_ms, late_ms + 1)) * 1_000_000 for one in (*said, *presses)}
+    every = sorted([*said, *presses], key=lambda one: one.log_ns)
+    parts = [[one for one in every if (one.log_ns + late_ns[id(one)] < cut) == early] for early in (True, False)]
+    zipped_up, joined = split(tmp_path, *parts)
+    assert_same(zipped_up, recording(), tolerance_mm=1e-12)
+    assert_same(joined, zipped_up)
+    for got in (zipped_up, joined):
+        assert dict(got.pedals)["/footpedals/coag"].stamps_ns.tolist() == [one.log_ns for one in presses]
+
+
+@pytest.mark.parametrize("pressed", [0, 1])
+def test_a_pedal_that_is_repeated_at_the_start_of_a_part_is_dropped_and_counted(tmp_path, pressed):
+    said, cut = messages_of(recording()), START_NS + 20 * STEP_NS
+    first = bag_writer.joy("/footpedals/coag", START_NS + 3, [1 - pressed])
+    last = bag_writer.joy("/footpedals/coag", START_NS + 8 * STEP_NS, [pressed])
+    again = [replace(first, log_ns=cut), replace(last, log_ns=cut + 1)]
+    early, late = ([one for one in said if (one.log_ns < cut) == is_early] for is_early in (True, False))
+    for got in split(tmp_path, sorted([*early, first, last], key=lambda one: one.log_ns), [*again, *late]):
+        pedal = dict(got.pedals)["/footpedals/coag"]
+        assert (pedal.values.tolist(), pedal.backward_stamps) == ([1 - pressed, pressed], 2)
+        assert [(one.topic, one.backward_stamps) for one in parse(got).about.dropped] == [("/footpedals/coag", 2)]
+
+
+def test_a_pedal_received_late_is_put_in_its_order_and_one_of_another_time_is_refused():
+    base, pedal = messages_of(recording()), "/console/camera"
+    at = [START_NS + k * STEP_NS for k in (10, 4, 20)]  # the second was measured 60 ms before the first
+    said = [replace(bag_writer.joy(pedal, stamp, [k % 2]), log_ns=START_NS + k) for k, stamp in enumerate(at)]
+    got = dict(read({"b.mcap": written([*base, *said])}).pedals)[pedal]
+    assert (got.stamps_ns.tolist(), got.values.tolist(), got.backward_stamps) == (sorted(at), [1.0, 0.0, 0.0], 0)
+    far = replace(bag_writer.joy(pedal, START_NS - 10**9, [1]), log_ns=START_NS + 9)
+    assert pedal in dict(read({"b.mcap": written([*base, *said, far])}).left_out)
 
 
 def test_a_file_that_the_recorder_packed_as_a_whole_is_read():

@@ -152,7 +152,7 @@ def test_a_last_number_that_lost_decimals_is_refused(cut):
 
 def test_a_last_number_is_compared_only_with_rows_that_agree():
     rows = "".join(f"0;50;{-120 - k / 8}\n" for k in range(40))  # of one to three decimals
-    assert mapped("PosX;PosY;PosZ\n" + rows + "0;50;-12").notes
+    assert mapped("PosX;PosY;PosZ\n" + rows + "0;50;-125").notes
     few = "".join(f"0;50;{-120 - k}.2500\n" for k in range(9))
     assert mapped("PosX;PosY;PosZ\n" + few + "0;50;-130.2").notes
 

@@ -17,6 +17,7 @@ from skills.kinematics import forward, quaternion_of
 from skills.remedies import Door
 from tests.formats import lerobots
 from tests.formats.lerobots import FPS, NEEDLE_DRIVER, STATE, columns_of, dataset, episode, packed, poses, write
+from tests.formats.others import zipped
 
 
 def read(files, frame="ECM"):
@@ -248,7 +249,7 @@ def test_seconds_since_1970_in_single_precision_are_no_clock():
 
 
 def test_double_precision_and_left_out_frames_keep_their_times():
-    assert stamped(1.76e9 + np.arange(40) / 50)[0][:2].tolist() == pytest.approx([1.76e18, 1.76e18 + 2e7], abs=240)
+    assert stamped(1.76e9 + np.arange(40) / 32)[0][:2].tolist() == pytest.approx([1.76e18, 1.76e18 + 3.125e7], abs=240)
     frames = np.delete(np.arange(41), 10)
     stamps_ns, _ = stamped((frames / FPS).astype(np.float32), frame_index=frames)
     assert stamps_ns[10] - stamps_ns[9] == pytest.approx(2e9 / FPS, abs=1)
@@ -456,3 +457,66 @@ def test_every_refusal_is_one_of_ours(tmp_path):
     (tmp_path / "empty.zip").write_bytes(b"PK\x03\x04")
     with pytest.raises(errors.SkillsError), find_dataset(tmp_path / "empty.zip"):
         pass
+
+
+# ---- the exporter of jhu-dvrk/data_collection ----------------------------------------------------------------------
+
+
+def from_topics(count=60, step_s=0.01, *, fps=30):
+    """Return an episode as its exporter infers it from a bag: a feature per topic, the fields of each sorted."""
+    one = poses(count).astype(np.float64)[:, :8]
+    q = lerobots.joints(count)
+    stamps = 1.76e9 + step_s * np.arange(count)
+    fields = {
+        "ros.PSM1.local.measured_cp": one[:, [6, 3, 4, 5, 0, 1, 2]],
+        "ros.PSM1.measured_cp": one[:, [6, 3, 4, 5, 0, 1, 2]] + [0, 0, 0, 0, 0.01, 0, 0.2],
+        "ros.SUJ.PSM1.measured_cp": one[:, [6, 3, 4, 5, 0, 1, 2]] * 0,
+        "ros.PSM1.jaw.measured_js": np.column_stack([np.zeros(count), one[:, 7]]),
+        "ros.PSM1.measured_js": np.column_stack([stamps, q]),
+    }
+    turn = [*(f"pose.orientation.{part}" for part in "wxyz"), *(f"pose.position.{axis}" for axis in "xyz")]
+    names = {name: {"axes": turn} for name in list(fields)[:3]} | {
+        "ros.PSM1.jaw.measured_js": {"axes": ["effort.0", "position.0"]},
+        "ros.PSM1.measured_js": {"axes": ["header.stamp.sec", *(f"position.{k}" for k in range(6))]},
+    }
+    columns = columns_of(count, **{"observation.state": None, "action": None}) | fields
+    columns["timestamp"] = stamps - stamps[0]
+    columns["timestamp_ns"] = np.rint(1e9 * stamps).astype(np.int64)
+    return zipped(episode(columns, names=names, fps=fps)), one, q
+
+
+def test_features_that_are_called_after_topics_are_read_by_the_exporters_own_clock():
+    data, one, q = from_topics()
+    got = read_recording(io.BytesIO(data), frame="ECM")
+    local, pose = got.motion_of(arm="PSM1"), got.motion_of(topic="/PSM1/measured_cp")
+    assert (local.topic, local.frame, pose.frame) == ("/PSM1/local/measured_cp", "PSM1_base", "ECM")
+    np.testing.assert_allclose(local.tip_mm, 1000 * one[:, :3], atol=1e-9)
+    np.testing.assert_allclose(pose.tip_mm[:, 2], 1000 * one[:, 2] + 200, atol=1e-9)
+    np.testing.assert_allclose(local.rotation_xyzw, one[:, 3:7], atol=1e-6)
+    np.testing.assert_allclose(got.joints[0].positions[:, 2], 1000 * q[:, 2])
+    np.testing.assert_allclose(got.jaw_of("PSM1").values, one[:, 7])
+    assert got.arms == ("PSM1",)
+    assert got.duration_s == pytest.approx(0.59)  # its fps of 30 is nominal
+    assert "ros.SUJ.PSM1.measured_cp" in dict(got.left_out)
+    assert read_recording(io.BytesIO(data)).arms == ("PSM1",)  # the frame of the other pose is not needed
+
+
+@pytest.mark.parametrize("jaw", [0.3, np.nan])
+def test_joints_and_a_jaw_without_an_arm_are_those_of_the_arm_whose_tool_is_stated(jaw, tmp_path):
+    q = lerobots.joints(60)
+    names = {"axes": [*(f"joint_{k}" for k in range(6)), "jaw"]}
+    state = np.column_stack([q, np.full(60, jaw)])
+    columns = columns_of(60, **{"observation.state": state, "action": state, "observation.meta.tool.psm1": None})
+    columns["observation.meta.tool.psm2"] = None
+    files = episode(
+        {k: v for k, v in columns.items() if v is not None}, names={"observation.state": names, "action": names}
+    )
+    with pytest.raises(errors.BadColumns, match="joints, which give no pose without"):
+        read_recording(io.BytesIO(zipped(files)))
+    with find_dataset(lerobots.write(files, tmp_path)) as dataset, io.BytesIO() as out:
+        cut_episode(dataset, choose_episodes(dataset, None)[0], out, tools={"PSM2": "400006"})
+        got = read_recording(out)
+    assert (got.arms, got.motion_of().frame) == (("PSM2",), "PSM2_base")
+    np.testing.assert_allclose(got.joints[0].positions[:, 2], 1000 * q[:, 2])
+    assert (got.jaw_of("PSM2") is None) == bool(np.isnan(jaw))
+    assert got.setpoints == ()

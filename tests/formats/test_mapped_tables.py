@@ -71,8 +71,8 @@ def test_nanoseconds_are_exact_and_times_of_another_unit_questioned():
     times = [1760000000123456789, 1760000000133456790]
     text = "t_ns,x_m,y_m,z_m\n" + "".join(f"{t},0,0,-0.1\n" for t in times)
     assert read(text).motion_of().stamps_ns.tolist() == times
-    with pytest.raises(errors.BadColumns, match="in which unit are they"):
-        read("Time;x_mm;y_mm;z_mm\n" + ROWS, column=["t_ns=Time"])
+    with pytest.raises(errors.ImplausibleMotion, match="In ms they would give 100 poses per second"):
+        read("Time;x_mm;y_mm;z_mm\n" + ROWS + "30;4.5;50.25;-120\n", column=["t_ns=Time"])
     with pytest.raises(errors.BadColumns, match="after the year 2096; give milliseconds"):
         read(text.replace("t_ns", "t_ms"))
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from skills.errors import BackwardStamps, NotFinite, NoUsableTopic, SkillsError
-from skills.formats import topics
+from skills.formats import bag_writer, read_recording, topics
+from skills.formats.bag_writer import messages_of
 from skills.formats.mcap import read_mcap
 from skills.formats.topics import TopicKind
-from tests.formats import large
+from tests.formats import bags, large, others
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, bag, header, pose, straight
 from tests.formats.definitions import DEFINITIONS
 
@@ -201,3 +202,36 @@ def test_four_arms_are_read_as_they_were_made():
     assert recording.integrity == "full"
     for one in recording.motions:
         assert np.ptp(one.tip_mm, axis=0).max() > 5.0
+
+
+@pytest.mark.parametrize("space", ["/dvrk", ""])
+def test_the_topics_of_dvrk_1_are_those_of_today_under_other_names(space):
+    arm, at = f"{space}/PSM1", [START_NS + k * STEP_NS for k in range(8)]
+    turn, place = (0.0, 0.0, 0.0, 1.0), (0.01, 0.05, -0.12)
+    said = []
+    for stamp_ns in at:
+        said += [
+            bag_writer.pose(f"{arm}/position_cartesian_current", stamp_ns, "ECM", (0.02, 0.0, 0.1), turn),
+            bag_writer.pose(f"{arm}/position_cartesian_local_current", stamp_ns, "PSM1_base", place, turn),
+            bag_writer.joint_state(f"{arm}/state_joint_current", stamp_ns, [0.1, 0.2, 0.15, 0.3, 0.4, 0.5]),
+            bag_writer.joint_state(f"{arm}/state_jaw_current", stamp_ns, [0.7]),
+            bag_writer.joint_state(f"{arm}/state_jaw_desired", stamp_ns, [0.6]),
+            bag_writer.joint_state(f"{space}/MTMR/state_gripper_current", stamp_ns, [0.5]),
+            bag_writer.joint_state(f"{arm}/state_wheel_current", stamp_ns, [0.5]),
+            bag_writer.joint_state(f"{arm}/state_joint_desired", stamp_ns, [0.5]),
+        ]
+    out = io.BytesIO()
+    bag_writer.write_messages(said, out)
+    got = read_recording(io.BytesIO(out.getvalue()))
+    assert got.motion_of().topic == f"{arm}/position_cartesian_local_current"
+    assert got.motion_of().states_base
+    assert got.joints[0].positions[0].tolist() == [0.1, 0.2, 150.0, 0.3, 0.4, 0.5]
+    assert (got.jaw_of("PSM1").values[0], got.jaw_setpoint_of("PSM1").values[0]) == (0.7, 0.6)
+    assert [name for name, _ in got.grippers] == ["MTMR"]
+    assert [topic for topic, _ in got.left_out] == [f"{arm}/state_wheel_current"]  # a setpoint of joints is never read
+
+
+def test_what_is_not_understood_of_an_arm_in_a_bag_of_ros_1_is_left_out_by_name(tmp_path):
+    odd = [bag_writer.joint_state("/PSM2/torque", START_NS + k, [0.1]) for k in range(9)]
+    path = others.rosbag1(sorted([*messages_of(bags.recording(20)), *odd], key=lambda m: m.log_ns), tmp_path / "a.bag")
+    assert [topic for topic, _ in read_recording(io.BytesIO(path.read_bytes())).left_out] == ["/PSM2/torque"]

@@ -75,7 +75,7 @@ def test_old_bags_give_the_tip_as_a_transform(tmp_path):
     with Writer1(tmp_path / "old.bag") as writer:
         connection = writer.add_connection("/PSM2/measured_cp", kind, typestore=others.NOETIC)
         for k in range(5):
-            stamp = types["builtin_interfaces/msg/Time"](1_760_000_000 + k, 5)
+            stamp = types["builtin_interfaces/msg/Time"](1_760_000_000, 10_000_000 * k)
             place = types["geometry_msgs/msg/Vector3"](0.001 * k, 0.05, -0.12)
             turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
             header = types["std_msgs/msg/Header"](k, stamp, "PSM2_base")
@@ -83,7 +83,7 @@ def test_old_bags_give_the_tip_as_a_transform(tmp_path):
             data = others.NOETIC.serialize_ros1(types[kind](header, "PSM2_tool", transform), kind)
             writer.write(connection, START_NS + k, data)
     got = read((tmp_path / "old.bag").read_bytes())
-    assert got.motion_of().stamps_ns.tolist() == [(1_760_000_000 + k) * 10**9 + 5 for k in range(5)]
+    assert got.motion_of().stamps_ns.tolist() == [1_760_000_000 * 10**9 + 10_000_000 * k for k in range(5)]
     np.testing.assert_array_equal(got.motion_of().tip_mm[:, 0], 1000.0 * (0.001 * np.arange(5)))
     assert [(topic.name, topic.type) for topic in got.topics] == [("/PSM2/measured_cp", kind)]
 

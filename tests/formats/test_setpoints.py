@@ -14,7 +14,6 @@ from skills.formats import bag_writer as messages
 from skills.formats import read_recording, topics
 from skills.formats.bag_writer import Message, messages_of, write_messages
 from skills.formats.columns import APART_MM
-from skills.formats.join import join
 from skills.formats.mcap import read_mcap
 from skills.formats.parsed import parse
 from skills.formats.reader_process import KNOWN
@@ -154,10 +153,17 @@ def test_a_damaged_message_of_setpoints_refuses_no_bag(tmp_path, monkeypatch):
     assert dict(found.left_out) == {TIP: f"A message of {TIP} ends within a field."}
 
 
+def later(count: int) -> Recording:
+    """Return the motion of the recording a second later."""
+    motion = recording(count).motions[0]
+    return Recording("mcap", "full", (replace(motion, stamps_ns=motion.stamps_ns + 10**9),))
+
+
 def test_parts_that_do_not_agree_lose_their_setpoints_alone():
-    one, other = (read_mcap(io.BytesIO(mcap(said))) for said in (tips(), [tip(k, frame="ECM") for k in range(COUNT)]))
-    later = replace(one.motions[0], stamps_ns=one.motions[0].stamps_ns + 10**9)
-    found = join([replace(one, jaws=()), replace(other, motions=(later,), jaws=(), clutch=None, pedals=())])
+    camera = sorted([*messages_of(later(COUNT)), *(tip(k, frame="ECM") for k in range(COUNT))], key=lambda m: m.log_ns)
+    with io.BytesIO() as out:
+        write_messages(camera, out)
+        found = read_mcap(io.BytesIO(mcap(tips())), others=[io.BytesIO(out.getvalue())])
     assert len(found.motions[0].stamps_ns) == 2 * COUNT
     assert found.setpoints == ()
     assert "record each frame on a separate topic" in dict(found.left_out)[TIP]

@@ -1,17 +1,22 @@
+import io
 import json
 
 import pytest
 
 from skills.demonstration.recording import Label
 from skills.errors import UnreadableRecording
+from skills.formats import read_recording, write_mcap
 from skills.formats.tags import read_labels
+from skills.formats.upload import find_bag
+from tests.formats.bags import recording
+from tests.formats.others import zipped
 
 T = 1_760_000_000_000_000_000
 FRAMES = [T + k * 33_333_333 for k in range(100)]
 
 
 def labels(**documents):
-    return read_labels({f"{name}.json": json.dumps(document) for name, document in documents.items()})
+    return read_labels({f"{name}.json": json.dumps(document) for name, document in documents.items()})[0]
 
 
 def stage(start, end, name="A1"):
@@ -79,5 +84,23 @@ def test_a_name_that_cannot_be_shown_is_mended():
 
 
 def test_what_is_no_json_is_refused_by_name():
-    with pytest.raises(UnreadableRecording, match="x_tags"):
-        read_labels({"s/x_tags.json": "{"})
+    for name, text in (("x_tags", "{"), ("x_left", '{"timestamps_ns": [1, 2')):
+        with pytest.raises(UnreadableRecording, match=name):
+            read_labels({f"s/{name}.json": text})
+
+
+@pytest.mark.parametrize(
+    "text", ['{\n  // which arms\n  "arms": ["PSM1"],\n}', "", "\x00\xff", "[1, 2", "arms: [PSM1]"]
+)
+def test_other_json_with_comments_or_damage_is_left_aside_and_named(text, tmp_path):
+    tags = json.dumps(stage({"cpu_ts": T}, {"cpu_ts": T}))
+    found, left_aside = read_labels({"s/arms.json": text, "s/x_tags.json": tags})
+    assert len(found) == 1
+    assert list(left_aside) == ["arms.json"]
+    members = {"s/b.mcap": write_mcap(recording()), "s/arms.json": text.encode("latin-1")}
+    got = read_recording(io.BytesIO(zipped(members)))
+    assert dict(got.left_out)["arms.json"].startswith("left aside")
+    for name, data in members.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    assert find_bag(tmp_path / "s").left_aside == ("arms.json",)

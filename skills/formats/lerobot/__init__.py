@@ -5,6 +5,7 @@
 One episode is one recording: a reader refuses several, so that the stored bytes of a recording belong to one surgeon.
 
     meta/info.json           the version, the rate `fps`, and the features: their types, lengths and names of numbers
+    meta/episodes.jsonl      v2.1: the number of frames of each episode, which must be that of its rows
     meta/tasks.jsonl         the tasks; in v3.0 `tasks.parquet`
     meta/suture-skills.json  ours, optional: `columns` under other names, and `tools` and `frames` of arms
     data/**/*.parquet        v2.1: one file per episode; v3.0: files of many episodes
@@ -29,14 +30,14 @@ from skills.errors import BadColumns, UnreadableRecording
 from skills.formats.archive import printable, shown
 from skills.formats.lerobot.parquet import ParquetColumn, open_parquet, read_rows
 
-INFO, STATEMENTS, TASK_LINES, TASK_TABLE = (
-    *("meta/info.json", "meta/suture-skills.json"),
+INFO, STATEMENTS, EPISODE_LINES, TASK_LINES, TASK_TABLE = (
+    *("meta/info.json", "meta/suture-skills.json", "meta/episodes.jsonl"),
     *("meta/tasks.jsonl", "meta/tasks.parquet"),
 )
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 JSON_CHARACTERS = 4 << 20  # the metadata of 100 features have 20,000
 NUMBERS = 5000  # of all features together
-TASKS = 10_000
+TASKS, EPISODES = 10_000, 100_000
 FASTEST_HZ = 10_000.0
 
 _SPAN = re.compile(r"(\d{1,9}):(\d{1,9})")
@@ -173,15 +174,33 @@ class Dataset:
         names = (name for name in self.files.names if name.startswith(self.root + folder))
         return sorted(name for name in names if name.endswith(".parquet") and not is_shadow(name))
 
-    def lines(self, name: str) -> list[Json]:
+    def check_length(self, episode: int | None, rows: int) -> None:
+        """Compare the rows of an episode with what the metadata claim of it.
+
+        Raises:
+            UnreadableRecording: `total_frames` of a dataset of one episode, or its line in v2.1, has another number.
+        """
+        claims = [(INFO, self.info.get("total_frames"))] if self.info.get("total_episodes") == 1 else []
+        if (name := self.root + EPISODE_LINES) in self.files.names:
+            lines = self.lines(name, most=EPISODES)
+            claims += [(EPISODE_LINES, one.get("length")) for one in lines if one.get("episode_index") == episode]
+        for where, claimed in claims:
+            if claimed != rows:
+                raise UnreadableRecording(
+                    f"{where} claims {printable(claimed)} frames, and the episode has {rows}: one of them is "
+                    "incomplete. Copy the dataset again.",
+                    found=rows,
+                )
+
+    def lines(self, name: str, *, most: int = TASKS) -> list[Json]:
         """Return the objects of a file with one per line.
 
         Raises:
             UnreadableRecording: A line is not JSON, or there are too many.
         """
         lines = [line for line in self.files.text(name).splitlines() if line.strip()]
-        if len(lines) > TASKS:
-            raise UnreadableRecording(f"{shown(name)} of the dataset has more than {TASKS} lines.")
+        if len(lines) > most:
+            raise UnreadableRecording(f"{shown(name)} of the dataset has more than {most} lines.")
         return [one for line in lines if isinstance(one := _parsed(line, name), dict)]
 
 
@@ -230,8 +249,8 @@ def _feature(name: str, described: Any) -> Feature:
         if dtype in ("image", "video"):
             return Feature(name, dtype, 1)
         width = prod(int(side) for side in shape)
-        # Some datasets have a list of one list of names, others one list under a word such as "motors".
-        names = next(iter(names.values())) if isinstance(names, dict) and len(names) == 1 else names
+        names = _listed(names) if isinstance(names, dict) else names
+        # some datasets have a list of one list of names
         names = names[0] if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list) else names
         flat = tuple(names) if isinstance(names, list) else ()
         if not 1 <= width <= NUMBERS or not all(isinstance(one, str) for one in flat) or len(flat) not in (0, width):
@@ -242,6 +261,15 @@ def _feature(name: str, described: Any) -> Feature:
             "many names as numbers."
         ) from error
     return Feature(name, dtype, width, flat)
+
+
+def _listed(names: Json) -> Any:
+    """Return names under words such as "motors", group after group; or those that have their indices as values."""
+    if all(isinstance(one, list) for one in names.values()):
+        return [name for group in names.values() for name in group]
+    if sorted(names.values()) == list(range(len(names))):
+        return sorted(names, key=names.__getitem__)
+    return next(iter(names.values())) if len(names) == 1 else names
 
 
 def _tasks_in(file: BinaryIO) -> dict[int, str]:

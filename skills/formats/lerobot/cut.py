@@ -18,12 +18,21 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 from skills.errors import BadInput, UnreadableRecording
-from skills.formats.archive import MAGIC, Archive, pack, refusing
-from skills.formats.lerobot import INFO, STATEMENTS, TASK_LINES, Dataset, Json, read_dataset, root_of
+from skills.formats.archive import HEAD_BYTES, MAGIC, Archive, check_pointer, pack, refusing
+from skills.formats.lerobot import (
+    EPISODE_LINES,
+    EPISODES,
+    INFO,
+    STATEMENTS,
+    TASK_LINES,
+    Dataset,
+    Json,
+    read_dataset,
+    root_of,
+)
 from skills.formats.lerobot.episode import several_episodes
 from skills.formats.lerobot.parquet import open_parquet, read_rows
 
-EPISODES = 100_000
 _EPISODE_FILE = re.compile(r"episode_(\d{1,9})\.parquet$")
 _DATA_FILE = re.compile(r"chunk-(\d{1,9})/file-(\d{1,9})\.parquet$")
 _KEPT = ("codebase_version", "robot_type", "fps", "splits", "features")  # of info.json; other keys may name people
@@ -45,7 +54,9 @@ class Folder:
     def text(self, name: str) -> str:
         """Return a file as text."""
         try:
-            return (self.path / name).read_text(encoding="utf-8-sig")
+            text = (self.path / name).read_text(encoding="utf-8-sig")
+            check_pointer(text[:HEAD_BYTES].encode())
+            return text
         except UnicodeDecodeError as error:
             raise UnreadableRecording(f"{name} of the dataset is not UTF-8 text. Copy it again.") from error
 
@@ -53,6 +64,8 @@ class Folder:
     def unpacked(self, name: str) -> Iterator[BinaryIO]:
         """Open a file."""
         with (self.path / name).open("rb") as file:
+            check_pointer(file.read(HEAD_BYTES))
+            file.seek(0)
             yield file
 
 
@@ -137,7 +150,7 @@ def cut_episode(
         tools: Arms and the numbers of their instruments, such as PSM1 and 400006.
 
     Raises:
-        UnreadableRecording: Its file is damaged, or has other episodes.
+        UnreadableRecording: Its file is damaged, has other episodes, or not the frames that the dataset claims.
     """
     from pyarrow import Table, parquet
 
@@ -147,6 +160,7 @@ def cut_episode(
         rows: Table = _rows_of(file, episode)
         if "episode_index" in rows.column_names and set(rows["episode_index"].unique().to_pylist()) != {number}:
             raise UnreadableRecording(f"The data of episode {number} are of other episodes; copy the dataset again.")
+        dataset.check_length(number, rows.num_rows)
         if episode.rows is None and not pictures & {*rows.column_names}:
             file.seek(0)
             data = file.read()
@@ -160,7 +174,7 @@ def cut_episode(
     named = [{"task_index": task, "task": dataset.tasks[task]} for task in tasks if task in dataset.tasks]
     members[TASK_LINES] = b"\n".join(map(_json, named))
     about = {"episode_index": number, "tasks": [one["task"] for one in named], "length": rows.num_rows}
-    members["meta/episodes.jsonl"] = _json(about)
+    members[EPISODE_LINES] = _json(about)
     before = dataset.statements
     changes = {"columns": {**before.columns, **columns}} if columns else {}
     changes |= {"tools": {**before.tools, **tools}} if tools else {}
@@ -194,13 +208,37 @@ def _episodes_in_files(dataset: Dataset) -> Iterator[Episode]:
             f"{wrong['dataset_from_index']} to {wrong['dataset_to_index']}; copy the dataset again."
         )
     files = {(int(found[1]), int(found[2])): name for name in dataset.data if (found := _DATA_FILE.search(name))}
-    first: dict[tuple[int, int], int] = {}
+    ends_at: dict[tuple[int, int], int] = {}
+    for place in places:
+        where = place["data/chunk_index"], place["data/file_index"]
+        ends_at[where] = max(ends_at.get(where, 0), place["dataset_to_index"])
+    first = {
+        where: index
+        for where, name in files.items()
+        if where in ends_at and (index := _first_index(dataset, name, ends_at[where])) is not None
+    }
     for place in sorted(places, key=lambda place: int(place["dataset_from_index"])):
         where = place["data/chunk_index"], place["data/file_index"]
         if where not in files:
             raise UnreadableRecording(f"The dataset has no file {where[1]} in chunk {where[0]}, which has episodes.")
         row = place["dataset_from_index"] - first.setdefault(where, place["dataset_from_index"])
         yield Episode(place["episode_index"], files[where], row, place["length"])
+
+
+def _first_index(dataset: Dataset, name: str, end: int) -> int | None:
+    """Return the number of a file's first row in the whole dataset, by which row `end` - 1 must be in the file.
+
+    Without it, as in datasets that number the rows of each episode, the first known episode begins with the file.
+    """
+    with dataset.files.unpacked(name) as file:
+        opened = open_parquet(file)
+        if "index" not in opened.schema_arrow.names:
+            return None
+        with refusing("A Parquet file of the dataset", "Copy the dataset again."):
+            batch = next(opened.iter_batches(1, columns=["index"], use_threads=False), None)
+            index = batch.column("index")[0].as_py() if batch is not None and len(batch) else None
+        rows = opened.metadata.num_rows
+    return index if isinstance(index, int) and end - index <= rows else None
 
 
 def _rows_of(file: BinaryIO, episode: Episode) -> Any:
@@ -228,6 +266,9 @@ def _info(dataset: Dataset, rows: int, pictures: set[str]) -> Json:
     """Return the metadata of one episode: those of the dataset, reduced to it."""
     info = {name: dataset.info[name] for name in _KEPT if name in dataset.info}
     info["features"] = {name: one for name, one in info["features"].items() if name not in pictures}
+    for one in dataset.features:
+        if one.names and isinstance(info["features"][one.name]["names"], dict):  # its order would be lost
+            info["features"][one.name] = info["features"][one.name] | {"names": list(one.names)}
     return info | {"codebase_version": "v2.1", "total_episodes": 1, "total_frames": rows}
 
 

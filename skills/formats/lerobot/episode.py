@@ -18,6 +18,11 @@ Separators may be dots, as in `observation.cartesian_state.psm1.pose.position.x`
 one, with the instrument whose number is in the dataset's tool name (`observation.meta.tool.psm1`), or in `tools` of our
 own file. Motions are called by the topics of a dVRK from which recorders take such columns.
 
+The exporter of jhu-dvrk/data_collection calls a feature after its topic and a number after its place in the message, as
+in `ros.PSM1.local.measured_cp` with `pose.position.x`; or, by its template, the joints and the jaw of one arm `joint_0`
+to `joint_5` and `jaw`, without the arm, which is then that of `tools`. Its clock is `timestamp_ns`; its `fps` are
+nominal.
+
 Of actions only those are used whose names say that they are setpoints, with `_sp` or `_setpoint`: under the names of
 the state an action may as well be the next state, or a difference. Setpoints that are not usable are left out.
 """
@@ -29,8 +34,16 @@ from dataclasses import replace
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic
-from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
+from skills.demonstration.recording import Joints, Motion, Recording, Topic, recorded_signal
+from skills.errors import (
+    BackwardStamps,
+    BadColumns,
+    ImplausibleMotion,
+    MixedFrames,
+    NotFinite,
+    NoUsableTopic,
+    UnreadableRecording,
+)
 from skills.formats import columns
 from skills.formats.archive import printable
 from skills.formats.lerobot import INFO, STATEMENTS, VERSIONS, Dataset, Feature, Files, read_dataset
@@ -40,6 +53,8 @@ from skills.remedies import Action, Remedy, did_you_mean
 
 NOTE_CHARACTERS = 200
 COARSE_S = 1e-3  # timestamps that are coarser, a float32 after 2.3 hours or in seconds since 1970, are no clock
+RATE_FACTOR, FEWEST_STEPS = 1.25, 3  # ours: recorders of 30 pictures a second really take 28
+CLOCK = "the recorder's clock"
 SAME_S = 1e-4  # LeRobot's own tolerance between timestamps and its rate
 
 _POSE = re.compile(
@@ -53,11 +68,20 @@ _JOINT = re.compile(
     re.I,
 )
 _JAW = re.compile(r"(?:observation\.state\.)?(psm\d{1,2})[._](?:jaw|gripper)(_sp|_setpoint)?", re.I)
+_ROS = r"ros\.(?:(?!SUJ\.)\w+\.)*?(psm\d{1,2})\."
+_ROS_POSE = re.compile(
+    _ROS + r"(local\.)?(measured_cp|setpoint_cp)\.(?:pose|transform)"
+    r"\.(?:(?:position|translation)\.([xyz])|(?:orientation|rotation)\.([xyzw]))",
+    re.I,
+)
+_ROS_ANGLE = re.compile(_ROS + r"(jaw\.)?(measured_js|setpoint_js)\.position\.([0-5])", re.I)
+_BARE_JOINTS, _BARE_JAW = tuple(f"joint_{k}" for k in range(6)), "jaw"
 _TOOL = re.compile(r"(?:observation\.meta\.tool\.)?(psm\d{1,2})(?:_tool_type)?", re.I)
 _NUMBER = re.compile(r"(?:^|:)(\d+)(?:\[|$)")  # of "LARGE_NEEDLE_DRIVER:400006[..11]", or alone
 _JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 _SCALARS = ("timestamp", "frame_index", "episode_index", "task_index")
-_SEC, _NANOSEC = "observation.meta.ros_time_sec", "observation.meta.ros_time_nsec"
+_CLOCKS = "observation.meta.ros_time_sec", "observation.meta.ros_time_nsec", "timestamp_ns"
+_SEC, _NANOSEC, _STAMP = _CLOCKS
 
 Place = tuple[str, int]  # a feature, and the index of one of its numbers
 LeftOut = tuple[str, str]  # a topic or a feature, and why it is not used
@@ -96,14 +120,20 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         commanded = {}
     _check_one_episode(dataset, table)
     stamps_ns, clock = _stamps_ns(dataset, table)
+    _check_rate(dataset, table, stamps_ns, clock)
     stamps_ns.setflags(write=False)  # so that all streams share it
     values = _values(table, meanings)
+    for arm, kind in [one for one, parts in values.items() if one[1] == "jaw" and np.isnan(parts[0]).all()]:
+        del values[arm, kind]
+        unknown.append((columns.topic_of(arm, kind), "All its numbers are NaN: it was not recorded."))
     tools = _tools(dataset, table)
     joints = {
         arm: Joints(arm, columns.topic_of(arm, kind), stamps_ns, one[0])
         for (arm, kind), one in values.items()
         if kind == "joints"
     }
+    for one in joints.values():
+        columns.check_joints(one.topic, one.positions)
     motions, left_out = _motions(values, joints, tools, stamps_ns, _frames(dataset, frame, {arm for arm, _ in values}))
     instruments = {arm: number for arm, tool in tools.items() if (number := _number(tool)) is not None}
     tips, jaw_setpoints, unusable = columns.setpoints_in(_values(table, commanded), motions, instruments, stamps_ns)
@@ -112,7 +142,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
         motions=motions,
         jaws=tuple(
-            (arm, Signal(stamps_ns, one[0][:, 0], columns.topic_of(arm, kind)))
+            (arm, recorded_signal(stamps_ns, one[0][:, 0], columns.topic_of(arm, kind)))
             for (arm, kind), one in values.items()
             if kind == "jaw"
         ),
@@ -128,7 +158,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
 
 def _read(dataset: Dataset, meanings: Mapping[columns.Quantity, Mapping[int, Place]]) -> ParquetTable:
     """Read the columns of some quantities, the scalars and the tools."""
-    used = {feature for places in meanings.values() for feature, _ in places.values()} | {*_SCALARS, _SEC, _NANOSEC}
+    used = {feature for places in meanings.values() for feature, _ in places.values()} | {*_SCALARS, *_CLOCKS}
     features = [one for one in dataset.features if (one.name in used and not one.is_text) or _arms_of_tools(one)]
     with dataset.files.unpacked(dataset.data[0]) as file:
         return read_columns(file, [one.column for one in features])
@@ -180,13 +210,7 @@ def _check_one_episode(dataset: Dataset, table: ParquetTable) -> None:
     numbers = table.column("episode_index")
     if numbers is not None and len(found := np.unique(numbers)) > 1:
         raise several_episodes(len(found))
-    claimed = dataset.info.get("total_frames")
-    if dataset.info.get("total_episodes") == 1 and claimed != table.rows:
-        raise UnreadableRecording(
-            f"{INFO} claims {printable(claimed)} frames, and the episode has {table.rows}: one of them is incomplete. "
-            "Copy the dataset again.",
-            found=table.rows,
-        )
+    dataset.check_length(None if numbers is None else int(numbers[0]), table.rows)
 
 
 # ---- columns and their meanings ------------------------------------------------------------------------------------
@@ -210,13 +234,14 @@ def _meanings(
     unknown, faults = [], {}
     for feature in numeric:
         action = feature.name == "action" or feature.name.startswith("action.")
-        if not (action or feature.name.startswith("observation.")) or feature.name in (_SEC, _NANOSEC):
+        if not (action or feature.name.startswith(("observation.", "ros."))) or feature.name in (_SEC, _NANOSEC):
             continue
+        bare = _bare(dataset, feature)
         nameless = []
         for index in range(feature.width):
             place, names = (feature.name, index), feature.called(index)
             said = (meaning_of(name.removeprefix("action.") if action else name) for name in names)
-            meaning = next((one for one in said if one is not None), None)
+            meaning = bare.get(index) or next((one for one in said if one is not None), None)
             if meaning is None or (action and meaning[1] not in columns.SETPOINTS):
                 nameless += [] if place in taken else [names[0]]
             elif meaning not in stated and place not in taken:
@@ -254,7 +279,26 @@ def meaning_of(name: str) -> tuple[str, str, int] | None:
         return joint[1].upper(), kind, int(which) - 1 if which.isdecimal() else _JOINT_NAMES.index(which)
     if jaw := _JAW.fullmatch(name):
         return jaw[1].upper(), "jaw_setpoint" if jaw[2] else "jaw", 0
+    if pose := _ROS_POSE.fullmatch(name):
+        kind = ("local_" if pose[2] else "") + ("pose" if pose[3].lower() == "measured_cp" else "setpoint")
+        part = f"position.{pose[4]}" if pose[4] else f"orientation.{pose[5]}"
+        return pose[1].upper(), kind, columns.POSE_PARTS.index(part.lower())
+    if angle := _ROS_ANGLE.fullmatch(name):
+        is_measured = angle[3].lower() == "measured_js"
+        if angle[2]:
+            return (angle[1].upper(), "jaw" if is_measured else "jaw_setpoint", 0) if angle[4] == "0" else None
+        return angle[1].upper(), "joints" if is_measured else "joint_setpoints", int(angle[4])
     return None
+
+
+def _bare(dataset: Dataset, feature: Feature) -> dict[int, tuple[str, str, int]]:
+    """Return the meanings of a state's numbers that are called after joints and no arm."""
+    if feature.name != "observation.state" or feature.names[:6] != _BARE_JOINTS:
+        return {}
+    arms = list(dataset.statements.tools)
+    arm = arms[0] if len(arms) == 1 else "PSM"
+    jaw = {6: (arm, "jaw", 0)} if feature.names[6:7] == (_BARE_JAW,) else {}
+    return {k: (arm, "joints", k) for k in range(6)} | jaw
 
 
 def _stated(dataset: Dataset, numeric: Sequence[Feature]) -> dict[tuple[str, str, int], Place]:
@@ -421,11 +465,13 @@ def _stamps_ns(dataset: Dataset, table: ParquetTable) -> tuple[Ints, str]:
         NotFinite: A timestamp is NaN or infinite.
         UnreadableRecording: A number is not that of a frame or of a clock.
     """
-    sec, nanosec = table.column(_SEC), table.column(_NANOSEC)
+    sec, nanosec, whole_ns = table.column(_SEC), table.column(_NANOSEC), table.column(_STAMP)
     if sec is not None and nanosec is not None:
         if not ((np.abs(sec) < 2**33) & (np.rint(sec) == sec) & (nanosec >= 0) & (nanosec < 1e9)).all():
             raise UnreadableRecording(f"{_SEC} and {_NANOSEC} are not whole seconds and nanoseconds of a clock.")
-        return sec.astype(np.int64) * 1_000_000_000 + np.rint(nanosec).astype(np.int64), "the recorder's clock"
+        return sec.astype(np.int64) * 1_000_000_000 + np.rint(nanosec).astype(np.int64), CLOCK
+    if whole_ns is not None and ((whole_ns >= 0) & (whole_ns < 2**62)).all():
+        return whole_ns.astype(np.int64), CLOCK
     frames, seconds = table.column("frame_index"), table.column("timestamp")
     frames = np.arange(table.rows, dtype=np.float64) if frames is None else frames
     if not ((frames >= 0) & (frames < 2**40)).all():
@@ -447,6 +493,26 @@ def _stamps_ns(dataset: Dataset, table: ParquetTable) -> tuple[Ints, str]:
     if step_s > COARSE_S:
         return _in_ns(even_s), f"{rate}; timestamp has steps of {step_s:g} s"
     return _in_ns(seconds), "timestamp, in single precision"
+
+
+def _check_rate(dataset: Dataset, table: ParquetTable, stamps_ns: Ints, clock: str) -> None:
+    """Refuse stamps that contradict the rate of the dataset.
+
+    Raises:
+        ImplausibleMotion: The median step is not that of `fps`, within a factor of `RATE_FACTOR`.
+    """
+    frames = table.column("frame_index")
+    steps = np.ones(table.rows - 1) if frames is None else np.diff(frames)
+    if len(steps) < FEWEST_STEPS or clock == CLOCK:  # which is in seconds and nanoseconds, whatever the fps are
+        return
+    step_s = float(np.median(np.diff(stamps_ns) / 1e9 / steps))
+    if step_s > 0 and not 1 / RATE_FACTOR <= step_s * dataset.fps <= RATE_FACTOR:
+        raise ImplausibleMotion(
+            f"The frames of the episode are {step_s:.6g} s apart by {clock}, and {1 / dataset.fps:.6g} s by the fps of "
+            f"{dataset.fps:g} in {INFO}: one of them is wrong, or in another unit. Correct it.",
+            step_s=step_s,
+            fps=dataset.fps,
+        )
 
 
 def _in_ns(seconds: Floats) -> Ints:

@@ -76,6 +76,13 @@ def open_parquet(file: BinaryIO) -> Any:
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - 8))
     end = file.read(8)
+    file.seek(0)
+    head = file.read(len(_MAGIC))
+    if head == _MAGIC != end[4:]:
+        raise UnreadableRecording(
+            f"{_WHAT} has no footer: its recorder was ended before it closed the file, or the copy ended early. "
+            "Compare its size with the original's; the other episodes can be sent without it."
+        )
     if end[4:] != _MAGIC or not 0 < int.from_bytes(end[:4], "little") <= min(FOOTER_BYTES, size):
         raise UnreadableRecording(f"{_WHAT} is truncated or corrupt. {_ADVICE}")
     file.seek(0)

@@ -26,8 +26,8 @@ import numpy as np
 from skills.errors import BadInput, Corrupt
 from skills.formats.archive import Archive, printable
 from skills.formats.checksums import SUMS, digest_of, read_sums, write_sums
-from skills.formats.lerobot import INFO, Dataset, Json
-from skills.formats.lerobot.cut import EPISODES, cut_episode, episodes_of, find_dataset
+from skills.formats.lerobot import EPISODES, INFO, Dataset, Json
+from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.lerobot.episode import episode_stamps
 from skills.formats.lerobot.parquet import open_parquet, read_rows
 from skills.formats.lerobot.writer import CHUNK, NO_PICTURES, as_json, as_line, joined_stats

@@ -8,8 +8,9 @@ The file is read once, sequentially, and every checksum is verified; see `reader
     none      no checksum (0 means "not available" in MCAP; rosbags writes 0): a flipped bit would not be detected
 
 Messages are taken in order of their log time, as every MCAP reader does; samples have the stamp of their header. Few
-poses, joints and jaw angles with stamps that decrease in that order are dropped and counted; events such as pedals are
-not, because each one counts. Messages without a header have their log time as stamp.
+poses, joints and jaw angles with stamps that decrease in that order are dropped and counted; of events such as pedals,
+each of which counts, only repeated messages are. Messages without a header have their log time as stamp, and so have
+all of a topic whose headers have the stamp 0. The parts of a split recording are read as one file.
 
 A demonstration needs the motions, the jaws and the clutch: an error in one of them refuses the file. All other topics,
 setpoints among them, are optional: one that cannot be used is omitted, and `left_out` has the reason.
@@ -25,8 +26,9 @@ from numpy.typing import NDArray
 
 from skills.arrays import Floats, Ints
 from skills.demonstration import recording
-from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
+from skills.errors import ImplausibleMotion, MixedFrames, MixedSources, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats import topics
+from skills.formats.columns import check_joints
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Field, Wanted, fields_of
 from skills.formats.mcap.reader import MAGIC, Channel, MessageSchema, Part, Walker
 from skills.formats.mcap.records import RECOVER
@@ -35,11 +37,16 @@ from skills.kinematics import INSERTION
 
 __all__ = ["MAGIC", "NeedsRosbags", "read_mcap"]
 
+OVERLAP_NS = 1_000_000_000  # ours: parts of a bag overlap by some messages, a restarted node not at all
+CLOCK_S = 0.5  # ours: shorter recordings are not compared with the time of their reception
+DECADE = 0.01  # ours, as a logarithm: 2 %
+NOTE_LIMIT = 500
 TOOL_LIMIT = 200  # characters of an instrument's name
 MeaningOf = Callable[[str, str], Meaning | None]  # of a topic and its message type
 
 _POSITION = Wanted(("position",), first=True)
 _ANGLES = (TopicKind.JAW, TopicKind.GRIPPER, TopicKind.JAW_SETPOINT)  # continuous values, the first of a joint state
+_MOVING = (TopicKind.MOTION, TopicKind.MASTER, TopicKind.SETPOINT, TopicKind.JOINTS, *_ANGLES)
 _WANTED = {
     topics.POSE: WANTED_POSE,
     topics.TRANSFORM: Wanted(
@@ -59,12 +66,16 @@ class NeedsRosbags(UnreadableRecording):
     """A valid file with message types that only rosbags can read; `numbers["integrity"]` is the file's integrity."""
 
 
-def read_mcap(file: BinaryIO, meaning: MeaningOf = topics.meaning) -> recording.Recording:
+def read_mcap(
+    file: BinaryIO, meaning: MeaningOf = topics.meaning, others: Iterable[BinaryIO] = ()
+) -> recording.Recording:
     """Read the used topics of a dVRK recording.
 
     Args:
         file: The MCAP file, at its beginning.
         meaning: Returns what a topic of a message type means; a topic without a meaning is not read.
+        others: The other parts of a recording that was split, in any order, each read before the next is taken. Their
+            messages are merged by log time.
 
     Returns:
         The recording, in millimetres.
@@ -76,7 +87,10 @@ def read_mcap(file: BinaryIO, meaning: MeaningOf = topics.meaning) -> recording.
         MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
     """
     try:
-        return _recording(_read_log(file, meaning))
+        log = _read_log(file, meaning)
+        for other in others:
+            log.merge(_read_log(other, meaning))
+        return _recording(log)
     except (SkillsError, MemoryError):
         raise
     except Exception as error:  # on a damaged file a parser may raise anything
@@ -90,11 +104,17 @@ class _Topic:
     name: str
     meaning: Meaning
     columns: list[Columns] = field(default_factory=list)
+    channels: list[Channel] = field(default_factory=list)  # of each of the columns
 
     @property
     def is_needed(self) -> bool:
         """True if a demonstration needs the topic."""
         return self.meaning.kind in (TopicKind.MOTION, TopicKind.JAW) or self.name in topics.CLUTCH_TOPICS
+
+    @property
+    def is_unset(self) -> bool:
+        """True if the stamps of all headers are 0, which in ROS means that the driver sets none."""
+        return bool(self.columns) and not any(one.stamps_ns is None or one.stamps_ns.any() for one in self.columns)
 
 
 @dataclass
@@ -108,6 +128,9 @@ class _Log:
     left_out: dict[str, str] = field(default_factory=dict)
     foreign: list[Channel] = field(default_factory=list)
     fields: dict[int, tuple[Field, ...]] = field(default_factory=dict)
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)  # of messages, by topic and type
+    notes: dict[str, str] = field(default_factory=dict)
+    integrities: set[recording.Integrity] = field(default_factory=set)
 
     def take(self, part: Part) -> None:
         """Decode the messages of a part whose topics are used, and store them."""
@@ -118,6 +141,7 @@ class _Log:
             topic = self.topics[channel.topic]
             try:
                 topic.columns.append(decoder.decode(part.data, *part.of(number)))
+                topic.channels.append(channel)
             except SkillsError as error:
                 self.leave_out(topic, error)
 
@@ -133,6 +157,29 @@ class _Log:
             raise error
         self.left_out[topic.name] = str(error)
         topic.columns.clear()
+        topic.channels.clear()
+
+    def merge(self, other: "_Log") -> None:
+        """Add the contents of another part of the same recording."""
+        for name, topic in other.topics.items():
+            mine = self.topics.setdefault(name, topic)
+            if mine is not topic:
+                mine.columns += topic.columns
+                mine.channels += topic.channels
+        self.left_out |= other.left_out
+        for name in self.left_out.keys() & self.topics.keys():
+            self.topics[name].columns.clear()
+            self.topics[name].channels.clear()
+        self.notes |= other.notes
+        self.counts += other.counts
+        self.integrities |= other.integrities
+
+    def close(self) -> None:
+        """Note what the whole file says, after its last part was taken."""
+        walker = self.walker
+        self.notes, self.integrities = dict(walker.notes), {walker.integrity}
+        for number, channel in walker.channels.items():
+            self.counts[channel.topic, self.type_of(channel)] += walker.counts[number]
 
     def type_of(self, channel: Channel) -> str:
         """Return the message type of a channel; "" for a channel without schema."""
@@ -164,6 +211,7 @@ def _read_log(file: BinaryIO, meaning: MeaningOf) -> _Log:
     log = _Log(Walker(file), meaning)
     for part in log.walker.parts():
         log.take(part)
+    log.close()
     if log.foreign:
         channel, integrity = log.foreign[0], log.walker.integrity
         schema = log.walker.schemas[channel.schema]
@@ -184,6 +232,12 @@ def _text(schema: MessageSchema) -> str:
 
 
 def _check_encoding(channel: Channel, schema: MessageSchema) -> None:
+    if channel.encoding == "ros1":
+        raise UnreadableRecording(
+            f"The MCAP file has the messages of a ROS 1 bag ({channel.topic}), which are not read from MCAP. Send the "
+            ".bag from which it was converted.",
+            topic=channel.topic,
+        )
     if (channel.encoding, schema.encoding) != ("cdr", "ros2msg"):
         raise UnreadableRecording(
             f"{channel.topic} is encoded as {channel.encoding!r} with a {schema.encoding!r} schema; only 'cdr' "
@@ -209,16 +263,15 @@ def _recording(log: _Log) -> recording.Recording:
     values = {kind: tuple(value for _, value in of_kind) for kind, of_kind in found.items()}
     signals = {kind: tuple(dict(of_kind).items()) for kind, of_kind in found.items()}  # the last one of each owner
     pedals = dict(signals[TopicKind.PEDAL])
-    counts: Counter[tuple[str, str]] = Counter()
-    for number, channel in log.walker.channels.items():
-        counts[channel.topic, log.type_of(channel)] += log.walker.counts[number]
+    (integrity, *others) = log.integrities
+    listed = topics.counted(log.counts)
     return recording.Recording(
         format="mcap",
-        integrity=log.walker.integrity,
+        integrity="partial" if others else integrity,
         motions=values[TopicKind.MOTION],
         jaws=signals[TopicKind.JAW],
         clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
-        topics=topics.counted(counts),
+        topics=listed,
         joints=values[TopicKind.JOINTS],
         masters=values[TopicKind.MASTER],
         grippers=signals[TopicKind.GRIPPER],
@@ -226,8 +279,8 @@ def _recording(log: _Log) -> recording.Recording:
         following=signals[TopicKind.FOLLOWING],
         scales=signals[TopicKind.SCALE],
         tools=tuple(found[TopicKind.TOOL]),
-        notes=tuple(sorted(log.walker.notes.items())),
-        left_out=tuple(sorted(log.left_out.items())),
+        notes=(*sorted(log.notes.items()), *_reception(log)),
+        left_out=tuple(sorted((dict(topics.not_understood(listed)) | log.left_out).items())),
         setpoints=values[TopicKind.SETPOINT],
         jaw_setpoints=signals[TopicKind.JAW_SETPOINT],
     )
@@ -269,6 +322,7 @@ def _joints(topic: _Topic) -> recording.Joints:
             raise NoUsableTopic(f"{topic.name} has {positions.shape[1]} joints; a PSM has 6.", topic=topic.name)
         with np.errstate(over="ignore"):  # infinite values are refused below
             positions[:, INSERTION] *= 1000.0  # ROS messages are in metres
+        check_joints(topic.name, positions)
     return recording.recorded_joints(topic.meaning.owner, topic.name, stamps_ns, positions)
 
 
@@ -278,7 +332,7 @@ def _signal(topic: _Topic) -> recording.Signal:
         raise NoUsableTopic(
             f"{topic.name} has messages without a value; remove the topic from the recording.", topic=topic.name
         )
-    make = recording.recorded_signal if topic.meaning.kind in _ANGLES else recording.Signal
+    make = recording.recorded_signal if topic.meaning.kind in _ANGLES else recording.recorded_events
     return make(stamps_ns, values[:, 0], topic.name)
 
 
@@ -308,12 +362,83 @@ def _in_order(topic: _Topic) -> tuple[Ints, Floats]:
             f"{topic.name} has messages with {widths[0]} and {widths[1]} values; record them on separate topics.",
             topic=topic.name,
         )
+    _check_one_source(topic)
     stamps_ns = _concatenated(list(_stamps(topic)))
+    _check_clocks(topic.name, stamps_ns, log_ns)
     values = _concatenated([columns.values for columns in topic.columns])
     if (log_ns[1:] >= log_ns[:-1]).all():
         return stamps_ns, values
     order = np.argsort(log_ns, kind="stable")  # messages of the same log time stay in the file's order
     return stamps_ns[order], values[order]
+
+
+def _check_one_source(topic: _Topic) -> None:
+    """Refuse a topic on which two publishers write at the same time: their poses would be woven into one motion.
+
+    Raises:
+        MixedSources: Two channels overlap in time by more than `OVERLAP_NS`, and do not repeat the same messages.
+    """
+    found: dict[int, list[Columns]] = {}
+    for channel, columns in zip(topic.channels, topic.columns, strict=True):
+        found.setdefault(channel.number, []).append(columns)
+    if len(found) == 1 or topic.meaning.kind not in _MOVING:
+        return
+    spans = sorted(
+        (min(int(c.log_ns.min()) for c in some), max(int(c.log_ns.max()) for c in some), number)
+        for number, some in found.items()
+    )
+    (_, end, one), *later = spans
+    for start, other_end, other in later:
+        if min(end, other_end) - start > OVERLAP_NS and not _repeats(found[one], found[other]):
+            named = {channel.number: f"{channel.number} {channel.publisher}".strip() for channel in topic.channels}
+            raise MixedSources(
+                f"{topic.name} has two publishers at the same time, on the channels {named[one]} and {named[other]}; "
+                "their poses are not one motion. Stop one of them, or keep one channel of the recording.",
+                topic=topic.name,
+                channels=[one, other],
+            )
+        end, one = max((end, one), (other_end, other))
+
+
+def _repeats(some: list[Columns], others: list[Columns]) -> bool:
+    """Return whether the messages of the shorter of two channels are all on the other one too."""
+    both = [
+        (
+            np.concatenate([c.log_ns.view(np.int64) if c.stamps_ns is None else c.stamps_ns for c in one]),
+            np.concatenate([c.values for c in one]),
+        )
+        for one in (some, others)
+    ]
+    (fewer_ns, fewer), (more_ns, more) = sorted(both, key=lambda one: len(one[0]))
+    order = np.argsort(more_ns)
+    at = order[np.searchsorted(more_ns, fewer_ns, sorter=order).clip(max=len(order) - 1)]
+    return bool((more_ns[at] == fewer_ns).all() and (more[at] == fewer).all())
+
+
+def _check_clocks(topic: str, stamps_ns: Ints, log_ns: NDArray[np.uint64]) -> None:
+    """Refuse stamps in another unit than their seconds: beside them is the time of reception.
+
+    Raises:
+        ImplausibleMotion: The stamps last a power of ten as long as the reception.
+    """
+    logged_s, stamped_s = float(np.ptp(log_ns)) / 1e9, float(np.ptp(stamps_ns)) / 1e9
+    if min(logged_s, stamped_s) > 0 and max(logged_s, stamped_s) >= CLOCK_S:
+        decades = np.log10(stamped_s / logged_s)
+        if abs(decades) > 0.5 and abs(decades - round(decades)) < DECADE:
+            raise ImplausibleMotion(
+                f"{topic}: its stamps last {stamped_s:.6g} s, and its messages were received within {logged_s:.6g} s: "
+                "the stamps are in another unit. Correct them, or the node that sets them.",
+                topic=topic,
+                stamped_s=stamped_s,
+                logged_s=logged_s,
+            )
+
+
+def _reception(log: _Log) -> list[tuple[str, str]]:
+    """Return the note that names the topics without stamps."""
+    unset = sorted(topic.name for topic in log.topics.values() if topic.is_unset)
+    words = f"the time of reception, since the stamps of all headers are 0: {', '.join(unset)}"
+    return [("stamps", words[:NOTE_LIMIT])] if unset else []
 
 
 def _concatenated(arrays: list[NDArray[Any]]) -> NDArray[Any]:
@@ -323,7 +448,7 @@ def _concatenated(arrays: list[NDArray[Any]]) -> NDArray[Any]:
 
 def _stamps(topic: _Topic) -> Iterable[Ints]:
     for columns in topic.columns:
-        if columns.stamps_ns is not None:
+        if columns.stamps_ns is not None and not topic.is_unset:
             yield columns.stamps_ns
         elif columns.log_ns.max() < 2**63:
             yield columns.log_ns.astype(np.int64)

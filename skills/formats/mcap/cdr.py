@@ -50,6 +50,11 @@ _ENCAPSULATION_BYTES = 4
 HEAD_BYTES = HEAD.size + MESSAGE.size  # the header, before the content of a message
 _LOG_AT = 15  # position of the log time in it (MCAP specification, "Message")
 _WORD_BYTES = 8
+_ZSTD = b"\x28\xb5\x2f\xfd"
+UNPACK = (
+    "Convert the bag with `ros2 bag convert -i BAG -o out.yaml`, where out.yaml has an output bag with `storage_id: "
+    "mcap`, `all: true` and no compression; or record with `--compression-mode file`."
+)
 _ORDERS = {0x0000: ">", 0x0001: "<"}  # plain CDR; parameter lists and XCDR 2 have other layouts
 SHAPES_LIMIT = 1000  # ours: messages of an arm do not change their lengths so often; bounds the cache
 
@@ -332,6 +337,8 @@ class _Cursor:
         self.text_ends = 0
         order = _ORDERS.get(int.from_bytes(message[:2], "big")) if len(message) >= self.at else None
         if order is None:
+            if message.startswith(_ZSTD):
+                raise UnreadableRecording(f"Messages of {topic} are compressed one by one, with zstd. {UNPACK}")
             raise UnreadableRecording(f"A message of {topic} is not plain CDR; record with the default middleware.")
         self._order = order
 

@@ -13,7 +13,7 @@ claimed sizes, before anything is decompressed; recorders stay far below all of 
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO, Final
 
 import numpy as np
@@ -72,12 +72,16 @@ class MessageSchema:
 
 @dataclass(frozen=True)
 class Channel:
-    """A topic of one publisher; `schema` is 0 if its messages have no type."""
+    """A topic of one publisher; `schema` is 0 if its messages have no type.
+
+    `publisher` is the name of its node, which only bags of ROS 1 have, and otherwise "".
+    """
 
     number: int
     schema: int
     topic: str
     encoding: str
+    publisher: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,7 +377,7 @@ class Walker:
             same = number != 0 and self.schemas.setdefault(number, schema) == schema
         else:
             channel = Channel(number, fields.number(2), fields.text(), fields.text())
-            fields.texts()
+            channel = replace(channel, publisher=fields.texts().get("callerid", "")[:80])
             same = self.channels.setdefault(number, channel) == channel
             if channel.schema and channel.schema not in self.schemas:
                 raise UnreadableRecording(f"{channel.topic!r} has a type that is not defined before it. {RECOVER}")

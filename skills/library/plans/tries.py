@@ -37,7 +37,6 @@ from skills.library.operation.jobs import JobRequest, RequestedJob, Store
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
-from skills.library.plans.headline import describe_errors
 from skills.library.plans.plans import hand_of, plan_sutures
 from skills.library.plans.playbacks import (
     check_playback,
@@ -444,8 +443,7 @@ def _play(
         row = find_playback(session, playback)
         line, report = headline_of(row, settings), row.report
         lowest_mm = min(z for one in row.plan.about.passes for _, _, z in one.path_mm)
-    errors = describe_errors(report.estimate.under[0].errors.name)
-    yield _done("play", f"{report.samples} samples in the simulator, and 1000 worlds with {errors}.", playback)
+    yield _done("play", f"{report.samples} samples in the simulator.", playback)
     verdict = _done("verdict", line.text, playback)
     if line.level == "bad" and report.failure is None and asked.errors == "uncalibrated":
         words = "judge it with the errors of a calibrated arm, if yours is one"

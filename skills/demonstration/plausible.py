@@ -1,0 +1,93 @@
+"""Whether times and positions of a motion are possible for a PSM, or in another unit than they were read in.
+
+    seconds (T,), tip_mm (T, 3) --pace_of--> Pace: samples per second, and the speed of the tip
+
+The *pace* speed is that of the path, not of the time: half of the path is travelled faster, so rests do not count, and
+neither do a few samples with a late stamp. In all hand-offs and trials that we have it is 9 to 90 mm/s. It is
+impossible above `TIP_MM_S`, which the joints of a PSM allow at full reach: hypot(r sqrt(2) 90 deg/s, 200 mm/s) + 9.1 mm
+1080 deg/s = 832 mm/s with r = 283.5 mm, the speeds being those of the dVRK's own trajectories (sawIntuitiveResearchKit,
+PSM.json and PSM_Si.json), rounded up. All other limits are ours.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from skills.arrays import Floats
+from skills.errors import ImplausibleMotion
+
+TIP_MM_S = 1000.0
+LATE_MM = 5.0  # a stamp that is late by 50 ms at 100 mm/s: what `DROPPED_GAP_NS` allows as well
+LEAST_HZ = 5.0  # a tip at 100 mm/s moves by 20 mm between two samples
+LEAST_MM_S = 1.0  # slower than the drift of a held hand
+MOST_HZ = 100_000.0
+USUAL_MM_S = (7.0, 120.0)
+USUAL_HZ = 250.0  # of columns that record a motion above USUAL_MM_S: pictures have at most 60 Hz, the dVRK has 100
+WINDOW_S = 0.05
+WINDOWS = 2000  # evenly spaced, however long the recording is
+
+
+class Pace(NamedTuple):
+    """Samples per second, from the median step, and the speed above which half of the path is travelled, in mm/s."""
+
+    rate_hz: float
+    speed_mm_s: float
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether a hand-off may have this pace."""
+        least, most = USUAL_MM_S
+        return LEAST_HZ <= self.rate_hz <= MOST_HZ and (self.speed_mm_s == 0.0 or least <= self.speed_mm_s <= most)
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        rate, speed = (f"{one:.3g}" if one < 1000 else f"{one:.0f}" for one in self)
+        return f"{rate} poses per second, and half of the path at more than {speed} mm/s"
+
+
+def pace_of(seconds: Floats, tip_mm: Floats) -> Pace:
+    """Measure the pace of a motion in windows of `WINDOW_S`.
+
+    Args:
+        seconds: Times from any near origin, shape (T,), strictly increasing, T at least 2.
+        tip_mm: Positions, shape (T, 3).
+    """
+    first = np.unique(np.linspace(0, len(seconds) - 2, WINDOWS).astype(np.int64))
+    last = np.searchsorted(seconds, seconds[first] + WINDOW_S).clip(first + 1, len(seconds) - 1)
+    way_mm = np.linalg.norm(tip_mm[last] - tip_mm[first], axis=1)
+    speed = way_mm / (seconds[last] - seconds[first])
+    order = np.argsort(speed)
+    travelled = np.cumsum(way_mm[order])
+    middle = order[np.searchsorted(travelled, travelled[-1] / 2)]
+    return Pace(1.0 / float(np.median(seconds[first + 1] - seconds[first])), float(speed[middle]))
+
+
+def check_steps(topic: str, stamps_s: Floats, tip_mm: Floats) -> None:
+    """Refuse a motion with a step that no PSM makes in its time.
+
+    Args:
+        topic: The topic, for the message.
+        stamps_s: Seconds since the recording's origin, shape (T,), strictly increasing.
+        tip_mm: Positions, shape (T, 3).
+
+    Raises:
+        ImplausibleMotion: Between two samples the tip moves further than at `TIP_MM_S`, and by `LATE_MM` more.
+    """
+    steps_s, moved = np.diff(stamps_s), np.diff(tip_mm, axis=0)
+    allowed_mm = TIP_MM_S * steps_s + LATE_MM
+    over = np.einsum("ij,ij->i", moved, moved) > allowed_mm * allowed_mm
+    if not over.any():
+        return
+    first = int(np.argmax(over))
+    step_mm = float(np.linalg.norm(moved[first]))
+    raise ImplausibleMotion(
+        f"{topic}: the tip jumps by {step_mm:.3g} mm within {1e3 * steps_s[first]:.3g} ms at {stamps_s[first]:.3f} s, "
+        f"at {step_mm / steps_s[first]:.0f} mm/s; a PSM moves its tip by at most {TIP_MM_S:.0f} mm/s. "
+        f"{int(over.sum())} of {len(over)} steps are such jumps: the frame was reset, samples are lost, or two sources "
+        "write to one topic. Cut the recording there.",
+        topic=topic,
+        at_s=float(stamps_s[first]),
+        step_mm=step_mm,
+        step_s=float(steps_s[first]),
+        jumps=int(over.sum()),
+    )
