@@ -70,7 +70,7 @@ class SharedReading:
         self.outcome: tuple[TableIn, Recording | ParsedContent | SkillsError] | None = None
 
     def read(self, read: Callable[..., Content], file: BinaryIO, reading: TableIn) -> Content:
-        """Read a file, unless one with its bytes was read with equal parameters; return the content, or raise the refusal.
+        """Read a file unless one with its bytes was read with equal parameters; return the content or raise a refusal.
 
         That the reader is busy is not an outcome: the next upload tries again.
         """
