@@ -122,7 +122,7 @@ def test_equal_bytes_that_arrive_at_once_wait_for_one_reading(tmp_path, monkeypa
         assert len(read) == 2
 
 
-def test_the_next_upload_of_equal_bytes_reads_them_where_the_first_was_not_read(tmp_path, monkeypatch):
+def test_the_next_of_equal_uploads_reads_where_the_first_was_not_read(tmp_path, monkeypatch):
     arrived, refused = Event(), []
     with serving(backends.fresh("sqlite", tmp_path)) as service, ThreadPoolExecutor(2) as clients:
         server = service.app.state.reader.server

@@ -200,9 +200,7 @@ def test_sessions_close_where_a_withdrawal_would_not_be_seen(posed: Service, mon
         assert closed(socket) == (BUSY, UNREADABLE)
 
 
-def test_while_the_database_is_unread_no_pose_is_given_and_the_session_stays(
-    posed: Service, monkeypatch: pytest.MonkeyPatch
-):
+def test_no_pose_is_given_while_the_database_is_unread(posed: Service, monkeypatch: pytest.MonkeyPatch):
     hand, look, unread = start_of(posed), sessions._look, [Busy("The database is busy.")]
 
     def fails(*given: Any) -> Any:
@@ -253,7 +251,7 @@ def test_a_session_for_which_the_processor_has_no_time_is_refused(posed: Service
         assert "no time for another session" in refused.value.json()["detail"]
 
 
-def test_the_capacity_is_measured_and_what_was_admitted_counts_until_it_sends(monkeypatch: pytest.MonkeyPatch):
+def test_the_capacity_is_measured_and_admitted_sessions_count_at_once(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sessions, "WINDOW_S", 0.05)
 
     async def admitted() -> list[int]:

@@ -132,7 +132,7 @@ def beside(port: int, do: Callable[[Event], object]) -> list[float]:
     """Return the seconds that the answers to another client took during `FLOOD_S` of something."""
     over, took = Event(), list[float]()
     thread = Thread(target=do, args=(over,))
-    with httpx.Client(base_url=f"http://127.0.0.1:{port}") as http:
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=FLOOD_S) as http:
         thread.start()
         until_s = monotonic() + FLOOD_S
         while (began_s := monotonic()) < until_s:

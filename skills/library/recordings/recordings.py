@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from functools import partial
-from typing import Any, BinaryIO, TypeVar, cast
+from typing import BinaryIO, TypeVar, cast
 
 from sqlalchemy import Select, delete, select, text, update
 from sqlalchemy.orm import Session
@@ -67,18 +67,18 @@ class SharedReading:
     """The outcome of the one reading of equal uploads that are handled at once."""
 
     def __init__(self) -> None:
-        self.outcome: tuple[dict[str, Any], Recording | ParsedContent | SkillsError] | None = None
+        self.outcome: tuple[TableIn, Recording | ParsedContent | SkillsError] | None = None
 
-    def read(self, read: Callable[..., Content], file: BinaryIO, options: dict[str, Any]) -> Content:
-        """Read a file, unless one with its bytes was read with equal options; return the content, or raise the refusal.
+    def read(self, read: Callable[..., Content], file: BinaryIO, reading: TableIn) -> Content:
+        """Read a file unless one with its bytes was read with equal parameters; return the content or raise a refusal.
 
         That the reader is busy is not an outcome: the next upload tries again.
         """
-        if self.outcome is None or self.outcome[0] != options:
+        if self.outcome is None or self.outcome[0] != reading:
             try:
-                self.outcome = options, read(file, **options)
+                self.outcome = reading, read(file, **reading.options)
             except (BadInput, UnknownFormat, TooLarge) as refusal:
-                self.outcome = options, refusal
+                self.outcome = reading, refusal
         _, outcome = self.outcome
         if isinstance(outcome, SkillsError):
             raise outcome
@@ -138,7 +138,7 @@ def read_upload(upload: Upload, read: Callable[..., Content]) -> Content:
         raise UnknownFormat(
             f"The content is {MEDIA_TYPES[right]}, which does not match Content-Type; send it as {right}."
         )
-    found = upload.shared.read(read, upload.file, upload.reading.options)
+    found = upload.shared.read(read, upload.file, upload.reading)
     recording = found.recording if isinstance(found, ParsedContent) else found
     if recording.format in BAGS and recording.integrity == "none" and not upload.vouched:
         raise UnreadableRecording(
