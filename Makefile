@@ -12,6 +12,7 @@ export PYTHONDONTWRITEBYTECODE :=
 export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 export SKILLS_TEST_JIGSAWS ?= $(abspath $(wildcard ../shared/jigsaws))
 export SKILLS_TEST_BENCHMARKS ?= $(abspath $(wildcard ../shared/benchmarks))
+export SKILLS_TEST_CASES ?= $(abspath $(wildcard ../shared/cases))
 
 .PHONY: demo test serve docs bench faults nightly mutants deep lint lock wheelhouse wheel-check clean
 

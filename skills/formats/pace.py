@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skills.demonstration.plausible import LEAST_HZ, MOST_HZ, TIP_MM_S, USUAL_HZ, USUAL_MM_S, Pace, pace_of
+from skills.demonstration.plausible import LEAST_HZ, MOST_HZ, TIP_MM_S, USUAL_HZ, USUAL_MM_S, MotionPace, pace_of
 from skills.demonstration.recording import Motion, Recording
 from skills.errors import ImplausibleMotion
 from skills.formats.cells import NS_PER
@@ -38,7 +38,7 @@ def check_pace(recording: Recording, options: ReadingOptions) -> None:
         )
 
 
-def _impossible(pace: Pace) -> str | None:
+def _impossible(pace: MotionPace) -> str | None:
     """Return what no PSM's recording has, in words."""
     if not pace.rate_hz >= LEAST_HZ:
         return f"with fewer than {LEAST_HZ:g} poses per second the path between them is not known"
@@ -56,7 +56,7 @@ def _is_declared(recording: Recording, options: ReadingOptions) -> bool:
     return recording.format in ("csv", "lerobot") and not (timed and {"x", "q3"} & stated)
 
 
-def _unusual(recording: Recording, pace: Pace) -> str | None:
+def _unusual(recording: Recording, pace: MotionPace) -> str | None:
     """Return what no hand-off has, in words."""
     least, most = USUAL_MM_S
     if pace.rate_hz > USUAL_HZ and pace.speed_mm_s > most:
@@ -73,10 +73,10 @@ def _times(recording: Recording, options: ReadingOptions) -> str:
     return "The stamps" if options.rate_hz is None else f"The positions at {options.rate_hz:g} Hz"
 
 
-def _pace(motions: Sequence[Motion], factor: float = 1.0) -> Pace:
+def _pace(motions: Sequence[Motion], factor: float = 1.0) -> MotionPace:
     """Return the pace of the motions with the highest, if their times were multiplied by a factor."""
     paces = [pace_of((one.stamps_ns - one.stamps_ns[0]) * (factor / 1e9), one.tip_mm) for one in motions]
-    return Pace(max(one.rate_hz for one in paces), max(one.speed_mm_s for one in paces))
+    return MotionPace(max(one.rate_hz for one in paces), max(one.speed_mm_s for one in paces))
 
 
 def _fitting(recording: Recording, moved: Sequence[Motion]) -> str:

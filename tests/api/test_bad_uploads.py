@@ -66,7 +66,7 @@ JOY = [
 TURNED = [bags.pose(bags.START_NS + k * bags.STEP_NS, 0.001 * k, frame="camera") for k in range(10, 20)]
 TWO_FRAMES = bags.pose_bag([*bags.straight(10), *TURNED])
 JIGSAWS = trials.text(trials.kinematics(60))
-STILL = cases.table(np.array([-10.0, 55, -135]) + np.linspace(-1, 1, 40)[:, None])
+STILL = cases.table(np.array([-10.0, 55, -135]) + np.linspace(-1, 1, 16)[:, None])
 CASES = {
     "empty": Bad(b"", 422, "unreadable-recording", MCAP),
     "an empty table": Bad(b"", 422, "unreadable-recording"),

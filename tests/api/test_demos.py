@@ -128,7 +128,8 @@ def test_the_same_bytes_read_in_another_way_are_refused(here: Service):
 def large_table() -> bytes:
     """Return a table of slightly more than 3 MiB: four chunks."""
     rows = 40_000
-    tip = np.tile(cases.points_mm(samples=rows // 3), (1, 1))
+    there = cases.points_mm(samples=rows // 30)
+    tip = np.concatenate([there, there[::-1]] * 5)
     return cases.table(tip + np.random.default_rng(0).normal(0, 1e-3, tip.shape), rate_hz=1000)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skills.seeds.recordings import sample_recordings
-from tests.api.service import CSV, MCAP, Service, assert_problem
+from tests.api.service import MCAP, Service, assert_problem
 from tests.library import cases
 
 KESTREL = {"surgeon": "kestrel", "suture": "simple-interrupted"}
@@ -69,7 +69,7 @@ def test_of_several_proposals_one_must_be_named(here: Service, stored: bool):
 def test_where_no_hand_off_is_proposed_the_whole_is_taken_with_a_warning(here: Service):
     """A cut of one hand-off need not begin and end with a rest, so it is accepted completely; the response warns."""
     creeping = np.linspace([0.0, 50.0, -120.0], [4.0, 50.0, -120.0], 400)  # half a millimetre per second
-    demo = send(here, cases.table(creeping), CSV, grid="fit", cell_mm=1.0).json()
+    demo = send(here, cases.bag(tip=creeping), grid="fit", cell_mm=1.0).json()
     assert here.http.get(f"/recordings/{demo['recording']}").json()["segments"] == []
     assert demo["segment"]["taken"] == "the whole recording"
     assert "no hand-off is proposed" in demo["segment"]["because"]

@@ -209,7 +209,7 @@ def test_names_of_features_in_any_form_are_read_also_from_a_cut(form, tmp_path):
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-def test_episodes_are_found_by_the_datasets_own_index_if_the_metadata_of_one_are_lost(lost, tmp_path):
+def test_episodes_are_found_though_the_metadata_of_one_are_lost(lost, tmp_path):
     files = lerobots.dataset("v3.0")
 
     name = "meta/episodes/chunk-000/file-000.parquet"

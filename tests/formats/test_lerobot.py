@@ -485,7 +485,7 @@ def from_topics(count=60, step_s=0.01, *, fps=30):
     return zipped(episode(columns, names=names, fps=fps)), one, q
 
 
-def test_features_that_are_called_after_topics_are_read_by_the_exporters_own_clock():
+def test_features_that_are_called_after_topics_are_read():
     data, one, q = from_topics()
     got = read_recording(io.BytesIO(data), frame="ECM")
     local, pose = got.motion_of(arm="PSM1"), got.motion_of(topic="/PSM1/measured_cp")
@@ -502,7 +502,7 @@ def test_features_that_are_called_after_topics_are_read_by_the_exporters_own_clo
 
 
 @pytest.mark.parametrize("jaw", [0.3, np.nan])
-def test_joints_and_a_jaw_without_an_arm_are_those_of_the_arm_whose_tool_is_stated(jaw, tmp_path):
+def test_joints_without_an_arm_are_those_of_the_stated_tool(jaw, tmp_path):
     q = lerobots.joints(60)
     names = {"axes": [*(f"joint_{k}" for k in range(6)), "jaw"]}
     state = np.column_stack([q, np.full(60, jaw)])

@@ -231,7 +231,7 @@ def test_the_topics_of_dvrk_1_are_those_of_today_under_other_names(space):
     assert [topic for topic, _ in got.left_out] == [f"{arm}/state_wheel_current"]  # a setpoint of joints is never read
 
 
-def test_what_is_not_understood_of_an_arm_in_a_bag_of_ros_1_is_left_out_by_name(tmp_path):
+def test_what_is_not_understood_of_an_arm_is_left_out_by_name(tmp_path):
     odd = [bag_writer.joint_state("/PSM2/torque", START_NS + k, [0.1]) for k in range(9)]
     path = others.rosbag1(sorted([*messages_of(bags.recording(20)), *odd], key=lambda m: m.log_ns), tmp_path / "a.bag")
     assert [topic for topic, _ in read_recording(io.BytesIO(path.read_bytes())).left_out] == ["/PSM2/torque"]

@@ -57,7 +57,7 @@ def in_ns(seconds):
 
 
 @pytest.mark.parametrize(("name", "scale", "right"), [("t_ms", 1, "s"), ("t_s", 1e3, "ms"), ("t_us", 1e3, "ms")])
-def test_times_in_another_unit_than_their_name_are_asked_about_with_the_one_that_fits(name, scale, right):
+def test_times_in_another_unit_are_asked_about_with_the_one_that_fits(name, scale, right):
     with pytest.raises(errors.ImplausibleMotion, match=rf"{name}.*In {right} they would give 100 poses per second"):
         read(table(*stroke(), time=name, scale=scale))
     assert read(table(*stroke(), time=name, scale=scale), column=[f"t_{right}={name}"]).duration_s == pytest.approx(
@@ -224,7 +224,7 @@ def test_a_restarted_node_is_no_second_source():
 
 
 def test_a_single_pose_is_refused_in_words_where_it_is_cut():
-    with pytest.raises(errors.BadSegment, match="single pose"):
+    with pytest.raises(errors.BadSegment, match="one sample"):
         cut_demo(read("t_s,x_mm,y_mm,z_mm\n0,1,50,-120\n"))
 
 

@@ -53,7 +53,7 @@ def test_degrees_that_have_the_numbers_of_radians_are_asked_about(names, radians
     read(table(*stroke(COUNT), **{name: 57.3 * values for name, values in columns.items()}))
 
 
-def test_joints_in_degrees_that_have_the_numbers_of_radians_are_asked_about():
+def test_joints_in_degrees_with_numbers_of_radians_are_asked_about():
     names = ["q1_deg", "q2_deg", "q3_m", "q4_deg", "q5_deg", "q6_deg"]
     rows = "\n".join(",".join(map(repr, [k / 100, *row])) for k, row in enumerate(lerobots.joints(40).tolist()))
     with pytest.raises(errors.BadColumns, match="radians have such numbers"):
@@ -89,7 +89,7 @@ def test_setpoints_and_grippers_in_degrees_are_left_out_with_the_reason():
         assert "degrees" in dict(beside(topic, OPEN_DEG[:, None].tolist()).left_out)[topic]
 
 
-def test_joints_in_degrees_beside_poses_are_left_out_of_a_bag_and_refused_in_columns():
+def test_joints_in_degrees_beside_poses_are_left_out_of_a_bag():
     degrees = lerobots.joints(COUNT)
     degrees[:, [0, 1, 3, 4, 5]] *= 180 / np.pi
     topic = "/PSM1/measured_js"

@@ -51,7 +51,7 @@ def poses(got: Recording) -> int:
     return len(got.motion_of().stamps_ns)
 
 
-def test_a_database_is_read_with_the_log_beside_it_in_a_zip_and_by_the_client(folder: Path):
+def test_a_database_is_read_with_the_log_beside_it(folder: Path):
     members = others.folder_members(folder, "s/")
     assert (poses(read(members)), read(members).integrity) == (COUNT, "full")
     for path in (folder, next(folder.glob("*.db3"))):
@@ -74,7 +74,7 @@ def test_a_database_whose_log_is_missing_is_refused_by_name(folder: Path):
         read_recording(content)
 
 
-def test_a_closed_database_in_wal_mode_is_whole_if_its_messages_are_counted_or_its_mode_was_changed(tmp_path: Path):
+def test_a_closed_database_in_wal_mode_is_whole_if_it_is_counted(tmp_path: Path):
     made = others.db3(messages_of(recording(COUNT)), tmp_path / "closed")
     path = next(made.glob("*.db3"))
     sqlite3.connect(path).execute("PRAGMA journal_mode=WAL").connection.close()

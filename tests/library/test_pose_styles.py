@@ -151,7 +151,7 @@ def test_a_demonstration_without_orientation_has_no_pose_style(database: Databas
 
 def test_a_motion_too_quick_for_its_tube_is_not_served(database: Database):
     tip = cases.points_mm()
-    add(database, turning(tip=np.concatenate([tip[:20], tip[58:]])))  # across the grid between two samples
+    add(database, turning(tip=np.concatenate([tip[:20], tip[57:]])))  # across the grid between two samples
     version = cases.train(database, release=True)
     with database.reading() as session, pytest.raises(NotFound, match="is not as long as the disturbance of 1 mm"):
         poses_of(session.get_one(PolicyVersion, version.row))

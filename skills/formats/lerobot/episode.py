@@ -18,10 +18,12 @@ Separators may be dots, as in `observation.cartesian_state.psm1.pose.position.x`
 one, with the instrument whose number is in the dataset's tool name (`observation.meta.tool.psm1`), or in `tools` of our
 own file. Motions are called by the topics of a dVRK from which recorders take such columns.
 
-The exporter of jhu-dvrk/data_collection calls a feature after its topic and a number after its place in the message, as
-in `ros.PSM1.local.measured_cp` with `pose.position.x`; or, by its template, the joints and the jaw of one arm `joint_0`
-to `joint_5` and `jaw`, without the arm, which is then that of `tools`. Its clock is `timestamp_ns`; its `fps` are
-nominal.
+The exporter of jhu-dvrk/data_collection has a feature per topic, and names numbers after their place in the message:
+
+    ros.PSM1.local.measured_cp  pose.position.x ...  as psm1_local_pose; measured_cp, measured_js, jaw.measured_js and
+                                                     the setpoints likewise
+    observation.state           joint_0 ... joint_5, jaw  of one arm, which `tools` in our own file names
+    timestamp_ns                                          the clock; its `fps` are nominal
 
 Of actions only those are used whose names say that they are setpoints, with `_sp` or `_setpoint`: under the names of
 the state an action may as well be the next state, or a difference. Setpoints that are not usable are left out.
