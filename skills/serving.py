@@ -344,6 +344,11 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
                 return
             super().data_received(data[at : at + SLICE_BYTES])
 
+    async def send(self, message: Any) -> None:
+        """Send an event; a refusal completes the handshake, or uvicorn would log an error for each."""
+        await super().send(message)
+        self.handshake_complete = self.handshake_complete or self.close_sent
+
     def handle_ping(self) -> None:
         """Answer a ping."""
         if self._counted():
