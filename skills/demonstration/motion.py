@@ -397,9 +397,7 @@ def recorded_signal(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
         first = int(np.argmax(wide))
         raise NotMetres(
             f"{topic}: a jaw's angle of {values[first]:g} rad {_at(stamps_ns, first)}; a jaw opens by less than "
-            f"{JAW_RAD:.4g} rad. Is it in degrees? Give radians, or name the unit of the column, as in jaw_deg.",
-            topic=topic,
-            sample=first,
+            f"{JAW_RAD:.4g} rad. Is it in degrees? Give radians, or name the unit of the column, as in jaw_deg."
         )
     kept, _, backward = forward_samples(topic, stamps_ns, values, equal_stamps=True)
     if kept is None:

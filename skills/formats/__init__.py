@@ -45,6 +45,7 @@ _OTHERS = (
     ),
     (b"\x89HDF", "HDF5; export a table"),
     (b"\x93NUMPY", "an array of NumPy; write a table, with numpy.savetxt and a header of names"),
+    (b"Format Version,", "an export of OptiTrack's Motive; delete the lines above Frame, and name each column"),
     (_PARQUET, "Parquet, a part of a LeRobot dataset; send an episode with its meta/info.json, as a zip"),
 )
 

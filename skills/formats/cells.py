@@ -229,7 +229,7 @@ def read_numbers(text: TextIO, layout: TableLayout) -> ParsedNumbers:
         text.seek(0)
         next(_lines(text, 1))  # the header
         row = next(csv_rows(text, first_line=_FIRST_ROW, separator=layout.separator))
-        _check_digits(layout.names, layout.time[0], row, _FIRST_ROW)
+        _check_digits(layout.names, layout.time[0], row)
     if layout.time is not None:
         column, unit = layout.time
         _check_early(layout.names[column], unit, numbers.groups[list(layout.groups).index([column])][:, 0])
@@ -237,8 +237,7 @@ def read_numbers(text: TextIO, layout: TableLayout) -> ParsedNumbers:
 
 
 def _mostly_repeated(stamps_ns: Ints) -> bool:
-    """Return whether more than half of the stamps repeat the one before."""
-    return len(stamps_ns) > 1 and bool(2 * np.count_nonzero(stamps_ns[1:] == stamps_ns[:-1]) > len(stamps_ns))
+    return bool(2 * np.count_nonzero(stamps_ns[1:] == stamps_ns[:-1]) > len(stamps_ns))
 
 
 def load_arrow() -> None:
@@ -475,7 +474,7 @@ def _since_1970(date: re.Match[str], ns_per_unit: int) -> str:
     return f"{Decimal(since_ns) / ns_per_unit:f}"
 
 
-def _check_digits(names: Sequence[str], column: int, cells: list[str], line: int) -> None:
+def _check_digits(names: Sequence[str], column: int, cells: list[str], line: int = _FIRST_ROW) -> None:
     """Refuse times that lost their digits, such as 1.76E+09, because they would repeat.
 
     Raises:
@@ -486,9 +485,7 @@ def _check_digits(names: Sequence[str], column: int, cells: list[str], line: int
     if mark and is_number(cell) and abs(float(exponent)) > sum(letter.isdigit() for letter in mantissa) - 1 >= 0:
         raise UnreadableRecording(
             f"Row {line}, column {names[column]}: {cell[:40]!r} has lost its last digits, in a spreadsheet or as a "
-            "float. Export the times with all digits, as whole numbers or as text.",
-            row=line,
-            column=names[column],
+            "float. Export the times with all digits, as whole numbers or as text."
         )
 
 

@@ -5,7 +5,7 @@
     # t_s,x_m,...      a header of numpy.savetxt
     1,2,3,             separators at the end of all rows, with or without one in the header
 
-What else is no plain table is refused with its name. Nothing of this depends on the numbers.
+Nothing of this depends on the numbers.
 """
 
 import codecs
@@ -29,18 +29,13 @@ def plain_table(file: BinaryIO) -> Iterator[BinaryIO]:
     """Yield a table without the peculiarities above: the file itself if it has none.
 
     Raises:
-        UnknownFormat: It is an export that is no table of columns.
+        UnknownFormat: It is not text in one encoding.
     """
     file.seek(0)
     head = file.read(4 * LINE_CHARACTERS)
     file.seek(0)
     is_utf16 = head.startswith(UTF16)
     lines = head.decode("utf-16" if is_utf16 else "utf-8-sig", "replace").splitlines()[:3]
-    if lines and lines[0].startswith("Format Version,"):
-        raise UnknownFormat(
-            "This is an export of OptiTrack's Motive, with several lines above its columns. Delete the lines above the "
-            "one that begins with Frame, give its columns names of their own, and state their meanings and units."
-        )
     is_marked = bool(lines) and _SEP.fullmatch(lines[0]) is not None
     header, row = (*lines[is_marked:], "", "")[:2]
     closing = next((one for one in SEPARATORS if _closes(header, row, one)), "")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skills.demonstration.plausible import LEAST_HZ, MOST_HZ, TIP_MM_S, USUAL_HZ, USUAL_MM_S, MotionPace, pace_of
-from skills.demonstration.recording import Motion, Recording
+from skills.demonstration.recording import Column, Motion, Recording
 from skills.errors import ImplausibleMotion
 from skills.formats.cells import NS_PER
 from skills.formats.tables import ReadingOptions
@@ -31,8 +31,10 @@ def check_pace(recording: Recording, options: ReadingOptions) -> None:
     pace = _pace(moved)
     fault = _impossible(pace) or (_unusual(recording, pace) if _is_declared(recording, options) else None)
     if fault is not None:
+        time = _time_of(recording)
+        what = "The stamps" if time is None else f"The times of the column {time.name[:80]}, read as {time.unit},"
         raise ImplausibleMotion(
-            f"{_times(recording, options)} give {pace}: {fault}. {_fitting(recording, moved)}",
+            f"{what} give {pace}: {fault}. {_fitting(recording, moved)}",
             rate_hz=pace.rate_hz,
             speed_mm_s=pace.speed_mm_s,
         )
@@ -44,9 +46,7 @@ def _impossible(pace: MotionPace) -> str | None:
         return f"with fewer than {LEAST_HZ:g} poses per second the path between them is not known"
     if not pace.rate_hz <= MOST_HZ:
         return f"no recorder takes more than {MOST_HZ:g} poses per second"
-    if not pace.speed_mm_s <= TIP_MM_S:
-        return f"the tip of a PSM moves at most at {TIP_MM_S:.0f} mm/s"
-    return None
+    return None if pace.speed_mm_s <= TIP_MM_S else f"the tip of a PSM moves at most at {TIP_MM_S:.0f} mm/s"
 
 
 def _is_declared(recording: Recording, options: ReadingOptions) -> bool:
@@ -66,11 +66,8 @@ def _unusual(recording: Recording, pace: MotionPace) -> str | None:
     return f"a hand-off is faster than {least:g} mm/s" if slow else None
 
 
-def _times(recording: Recording, options: ReadingOptions) -> str:
-    time = next((column for column in recording.columns if column.quantity == "t"), None)
-    if time is not None:
-        return f"The times of the column {time.name[:80]}, read as {time.unit},"
-    return "The stamps" if options.rate_hz is None else f"The positions at {options.rate_hz:g} Hz"
+def _time_of(recording: Recording) -> Column | None:
+    return next((column for column in recording.columns if column.quantity == "t"), None)
 
 
 def _pace(motions: Sequence[Motion], factor: float = 1.0) -> MotionPace:
@@ -81,18 +78,17 @@ def _pace(motions: Sequence[Motion], factor: float = 1.0) -> MotionPace:
 
 def _fitting(recording: Recording, moved: Sequence[Motion]) -> str:
     """Return the unit of time that would make sense, or what to do if there is none."""
-    time = next((column for column in recording.columns if column.quantity == "t"), None)
-    known = NS_PER if time is None else {unit: ns for unit, ns in NS_PER.items() if unit != time.unit}
-    own_ns = 1_000_000_000 if time is None else NS_PER[time.unit]
-    for unit, ns in known.items():
-        for factor in {ns / own_ns} if time is not None else {ns / own_ns, own_ns / ns}:
-            if factor != 1 and (found := _pace(moved, factor)).is_usual:
-                if time is None:
-                    return f"Times {factor:g} times as long would give {found}: correct their unit."
-                return (
-                    f"In {unit} they would give {found}. In which unit are they? Name their column as "
-                    f"t_{unit}={time.name[:80]}, or as t_{time.unit} together with the positions if all are right."
-                )
+    time = _time_of(recording)
+    for unit, ns in NS_PER.items():
+        factor = ns / NS_PER[time.unit if time else "s"]
+        found = _pace(moved, factor)
+        if time is not None and unit != time.unit and found.is_usual:
+            return (
+                f"In {unit} they would give {found}. In which unit are they? Name their column as "
+                f"t_{unit}={time.name[:80]}, or as t_{time.unit} together with the positions if all are right."
+            )
+        if time is None and factor != 1 and (found.is_usual or _pace(moved, 1 / factor).is_usual):
+            return f"Times in another unit, {factor:g} of a second or the reverse, would give a usual pace: correct it."
     return (
         "Check the units of times and positions (m or mm, not cm or inches), and name the columns with the right ones: "
         "t_s=NAME or t_ms=NAME, x_mm=NAME or x_m=NAME."

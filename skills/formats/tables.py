@@ -435,7 +435,6 @@ def _check_degrees(names: Sequence[str], uses: Mapping[str, _Use], columns: Mapp
                 f"numbers. Name the columns with the right unit, as in {name}_rad={first}; if they are degrees, give "
                 "them in radians.",
                 column=first,
-                greatest=greatest,
             )
 
 

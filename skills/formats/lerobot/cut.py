@@ -208,16 +208,11 @@ def _episodes_in_files(dataset: Dataset) -> Iterator[Episode]:
             f"{wrong['dataset_from_index']} to {wrong['dataset_to_index']}; copy the dataset again."
         )
     files = {(int(found[1]), int(found[2])): name for name in dataset.data if (found := _DATA_FILE.search(name))}
-    ends_at: dict[tuple[int, int], int] = {}
+    places.sort(key=lambda place: int(place["dataset_from_index"]))
+    last = {(one["data/chunk_index"], one["data/file_index"]): one["dataset_to_index"] for one in places}
+    known = {where: _first_index(dataset, files[where], end) for where, end in last.items() if where in files}
+    first = {where: index for where, index in known.items() if index is not None}
     for place in places:
-        where = place["data/chunk_index"], place["data/file_index"]
-        ends_at[where] = max(ends_at.get(where, 0), place["dataset_to_index"])
-    first = {
-        where: index
-        for where, name in files.items()
-        if where in ends_at and (index := _first_index(dataset, name, ends_at[where])) is not None
-    }
-    for place in sorted(places, key=lambda place: int(place["dataset_from_index"])):
         where = place["data/chunk_index"], place["data/file_index"]
         if where not in files:
             raise UnreadableRecording(f"The dataset has no file {where[1]} in chunk {where[0]}, which has episodes.")
@@ -230,14 +225,12 @@ def _first_index(dataset: Dataset, name: str, end: int) -> int | None:
 
     Without it, as in datasets that number the rows of each episode, the first known episode begins with the file.
     """
-    with dataset.files.unpacked(name) as file:
+    with dataset.files.unpacked(name) as file, refusing("A Parquet file of the dataset", "Copy the dataset again."):
         opened = open_parquet(file)
-        if "index" not in opened.schema_arrow.names:
-            return None
-        with refusing("A Parquet file of the dataset", "Copy the dataset again."):
-            batch = next(opened.iter_batches(1, columns=["index"], use_threads=False), None)
-            index = batch.column("index")[0].as_py() if batch is not None and len(batch) else None
         rows = opened.metadata.num_rows
+        if not rows or "index" not in opened.schema_arrow.names:
+            return None
+        index = next(opened.iter_batches(1, columns=["index"], use_threads=False)).column("index")[0].as_py()
     return index if isinstance(index, int) and end - index <= rows else None
 
 

@@ -511,9 +511,7 @@ def _check_rate(dataset: Dataset, table: ParquetTable, stamps_ns: Ints, clock: s
     if step_s > 0 and not 1 / RATE_FACTOR <= step_s * dataset.fps <= RATE_FACTOR:
         raise ImplausibleMotion(
             f"The frames of the episode are {step_s:.6g} s apart by {clock}, and {1 / dataset.fps:.6g} s by the fps of "
-            f"{dataset.fps:g} in {INFO}: one of them is wrong, or in another unit. Correct it.",
-            step_s=step_s,
-            fps=dataset.fps,
+            f"{dataset.fps:g} in {INFO}: one of them is wrong, or in another unit. Correct it."
         )
 
 

@@ -156,6 +156,11 @@ class Columns:
     label_of: Ints
 
     @property
+    def known_ns(self) -> NDArray[np.integer]:
+        """The stamps, or the log times of messages without."""
+        return self.log_ns if self.stamps_ns is None else self.stamps_ns
+
+    @property
     def labels_in_order(self) -> list[str]:
         """The labels in order of first appearance."""
         if len(self.labels) == 1:
