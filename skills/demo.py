@@ -249,7 +249,7 @@ def verdict(playback: Playback) -> str:
     line = playback.headline
     if not playback.feasible or line is None or line.probability is None:
         return "feasible, not judged" if playback.feasible else str(playback.report.failure_sentence)
-    return f"feasible, {line.probability.count} of {line.probability.of} worlds"
+    return f"feasible; {line.event} in {line.probability.count} of {line.probability.of} worlds"
 
 
 if __name__ == "__main__":

@@ -22,6 +22,15 @@ class SurgeonKeywords(TypedDict, total=False):
     consent: Annotated["ConsentIn | Mapping[str, Any] | None", Doc("The uses that the surgeon agreed to.")]
 
 
+class SutureTypeKeywords(TypedDict, total=False):
+    """The fields of SutureTypeIn."""
+
+    name: Annotated[Required[str], Doc(".")]
+    also_called: Annotated[Sequence[str], Doc(".")]
+    family: Annotated[Required[str], Doc(".")]
+    description: Annotated[str, Doc(".")]
+
+
 class TableKeywords(TypedDict, total=False):
     """The fields of TableIn."""
 

@@ -14,7 +14,6 @@ from types import TracebackType
 from typing import Any
 
 OURS = "skills"
-ADOPTED = "recorded outcome"  # end of the engine's message about a job that was cancelled or taken over
 PLACES = 12  # innermost frames of a traceback that are logged
 
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
@@ -29,18 +28,6 @@ def configure(level: str, *, as_json: bool) -> None:
     root.handlers[:] = [handler]
     root.setLevel(logging.WARNING)
     logging.getLogger(OURS).setLevel(level.upper())
-    engine = logging.getLogger("dbos")
-    engine.addHandler(logging.NullHandler())  # without a handler it would add one of its own
-    engine.addFilter(_fault)
-
-
-def _fault(record: logging.LogRecord) -> bool:
-    """Return whether a record of the job engine is of a fault.
-
-    A job that a user cancels while it runs is none, and of a job that was taken over `skills.jobs.workflows` logs it.
-    """
-    error = record.exc_info[1] if record.exc_info else None
-    return not (type(error).__name__ == "DBOSAwaitedWorkflowCancelledError" or str(record.msg).endswith(ADOPTED))
 
 
 def log_fields(logger: logging.Logger, message: str, level: int = logging.INFO, **fields: Any) -> None:

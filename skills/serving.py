@@ -9,6 +9,7 @@ never delays a response. The service answers first; work that only some requests
 is done afterwards in a thread.
 """
 
+import asyncio
 import errno
 import gc
 import logging
@@ -28,10 +29,12 @@ from typing import Any, cast
 
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from skills import logs
 from skills.api.app import create_app, prepare_database, prepare_to_serve
-from skills.api.sessions import MESSAGE_BYTES
+from skills.api.rate_limits import Bucket
+from skills.api.sessions import FLOODED, MESSAGE_BYTES
 from skills.client import Client
 from skills.compiled import check_cache_setting
 from skills.db.session import Database
@@ -204,10 +207,10 @@ def environment(settings: Settings) -> dict[str, str]:
     return others | ours
 
 
-def prepare(settings: Settings) -> None:
-    """Migrate the database and seed its catalogue."""
+def prepare(settings: Settings) -> bool:
+    """Migrate the database and seed its catalogue; return whether it was migrated."""
     with closing(Database.of(settings)) as database:
-        prepare_database(database, settings)
+        return prepare_database(database, settings)
 
 
 def refuse_keyless(settings: Settings) -> None:
@@ -291,6 +294,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
             ssl_keyfile=settings.tls_key,
             proxy_headers=False,  # the caller is not derived from headers that anybody can send
             http=connections(settings),
+            ws=LimitedWebSocket,
             ws_max_size=MESSAGE_BYTES,
             ws_ping_interval=settings.heartbeat_s,
             ws_ping_timeout=settings.heartbeat_s,
@@ -309,6 +313,71 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
         server.run()
     if server.refused is not None:
         raise server.refused
+
+
+# Ours: frames that complete no message, which a client needs every few seconds to ping. They never reach a session.
+FRAMES, FRAMES_PER_S = 20, 5.0
+SLICE_BYTES = 256  # parsed before the next ones: a client that sends many frames at once must not hold up the others
+FLOODED_BY_FRAMES = f"At most {FRAMES_PER_S:g} frames without a message a second, and {FRAMES} at once."
+
+
+class ArrivalQueue(asyncio.Queue[Any]):
+    """A queue of ASGI events that notes when each of them arrived."""
+
+    def put_nowait(self, item: Any) -> None:
+        """Add an event with `arrived_s`, of the monotonic clock."""
+        super().put_nowait(item | {"arrived_s": time.monotonic()})
+
+
+class LimitedWebSocket(WebSocketsSansIOProtocol):
+    """A WebSocket that is closed when it gets too many frames that complete no message."""
+
+    def __init__(self, *given: Any, **how: Any) -> None:
+        super().__init__(*given, **how)
+        self.queue = ArrivalQueue()
+        self._bucket = Bucket(FRAMES, FRAMES_PER_S)
+
+    def data_received(self, data: bytes) -> None:
+        """Parse what arrived, slice by slice, until the connection ends."""
+        for at in range(0, len(data), SLICE_BYTES):
+            if self.close_sent:
+                return
+            super().data_received(data[at : at + SLICE_BYTES])
+
+    async def send(self, message: Any) -> None:
+        """Send an event; a refusal completes the handshake, or uvicorn would log an error for each."""
+        await super().send(message)
+        self.handshake_complete = self.handshake_complete or self.close_sent
+
+    def handle_ping(self) -> None:
+        """Answer a ping."""
+        if self._counted():
+            super().handle_ping()
+
+    def handle_pong(self, event: Any) -> None:
+        """Take the answer to a ping."""
+        if self._counted():
+            super().handle_pong(event)
+
+    def handle_text(self, event: Any) -> None:
+        """Take a message, or its first piece."""
+        if event.fin or self._counted():
+            super().handle_text(event)
+
+    def handle_cont(self, event: Any) -> None:
+        """Take a further piece of a message."""
+        if self._counted():
+            super().handle_cont(event)
+
+    def _counted(self) -> bool:
+        """Count a frame; return whether it is taken, and close the connection if there are too many."""
+        if self.close_sent:
+            return False
+        if self._bucket.take(1.0) == 0:
+            return True
+        self.conn.fail(FLOODED, FLOODED_BY_FRAMES)
+        self.handle_parser_exception()  # sends the reason, ends the session and closes the connection
+        return False
 
 
 class Server(uvicorn.Server):

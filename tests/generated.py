@@ -44,6 +44,7 @@ STYLE = {"surgeon", "suture"}
 # The keywords of calls: the model of the request, and the fields that a call takes by position or in its own way.
 KEYWORDS: dict[str, tuple[type[BaseModel], set[str]]] = {
     "SurgeonKeywords": (people.SurgeonIn, set()),
+    "SutureTypeKeywords": (people.SutureTypeIn, set()),
     "TableKeywords": (recordings.TableIn, set()),
     "DemoKeywords": (demos.DemoIn, set()),
     "DatasetKeywords": (datasets.DatasetIn, set()),

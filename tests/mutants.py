@@ -401,7 +401,7 @@ GUARDS = (
         ("tests/api/test_policy_cache.py", *(f"tests/api/test_served.py::test_{name}" for name in (
             "erased_policies_leave_all_processes_memory_without_a_request",
             "the_short_way_and_the_long_one_give_the_same_answers",
-            "a_policy_cached_is_not_given_to_whoever_may_not_see_it",
+            "a_cached_policy_is_not_given_to_whoever_may_not_see_it",
             "a_policy_learnt_again_after_an_erasure_gets_its_own_dates",
         ))),
     ),
@@ -421,7 +421,7 @@ GUARDS = (
     Guard(
         "skills/library/operation/erasure_list.py", 20,
         ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
-        ("Erasures", "_latest", "_knows", "_later", "_listed", "_in_order", "_end_again", "_mark_again", "_here",
+        ("Erasures", "_newer", "_merged", "_order", "_listed", "_in_order", "_end_again", "_mark_again", "_served",
          "_narrow", "_both"),
     ),
     Guard(

@@ -213,6 +213,7 @@ WAITS = (ast.Yield, ast.YieldFrom, ast.Await, ast.AsyncFor, ast.AsyncWith)
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)
 MAY_YIELD_A_SESSION = {
     "db/session.py: reading",
+    "db/session.py: ending",
     "db/session.py: writing",
 }  # a `with` of their own
 

@@ -1,5 +1,6 @@
 """The script that tests mutants: its changes by hand, and a list of explanations without stale ones."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -56,6 +57,18 @@ def test_a_seed_draws_the_same_mutants_of_every_guard_and_at_least_200():
     assert len(first) >= 200
     files = {one.partition("::")[0] for guard in GUARDS for one in (guard.file, *guard.tests)}
     assert all((ROOT / file).exists() for file in files)
+
+
+def test_the_tests_and_functions_that_guards_name_exist():
+    named = [one.partition("::") for guard in GUARDS for one in guard.tests if "::" in one]
+    named += [(guard.file, "", name) for guard in GUARDS for name in guard.parts]
+    gone = [
+        (file, name)
+        for file, _, name in named
+        if not re.search(rf"^ *(def|class) {name.partition('[')[0]}\b", (ROOT / file).read_text(), re.MULTILINE)
+        and not re.search(rf"^{name} = ", (ROOT / file).read_text(), re.MULTILINE)
+    ]
+    assert gone == []
 
 
 def test_every_explanation_is_of_a_mutant_that_exists():

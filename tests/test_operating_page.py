@@ -4,19 +4,27 @@ import json
 import os
 import re
 import shlex
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from skills.cli import app
+from skills.db.session import Database
+from skills.library.operation.history import sign_history
 from skills.settings import Settings, settings
-from tests.api.service import copy_of_trained
+from tests.api.keyed import copy_of_told
+from tests.api.service import copy_of_trained, serving
+from tests.library.cases import wrong
 
-PAGE = (Path(__file__).parent.parent / "docs" / "operating.md").read_text()
+DOCS = Path(__file__).parent.parent / "docs"
+PAGE = (DOCS / "operating.md").read_text()
+SQL = [one for page in sorted(DOCS.glob("*.md")) for one in re.findall(r"`(DELETE\s+FROM\s[^`]+)`", page.read_text())]
 UNITS = [block for block in re.findall(r"```ini\n(.*?)```", PAGE, re.DOTALL) if "[Service]" in block]
 
 
@@ -39,6 +47,9 @@ def test_every_command_of_the_page_runs_in_the_order_of_the_page(folder: Path, m
             name, _, value = words[1].partition("=")
             monkeypatch.setenv(name, value)
             settings.cache_clear()
+            if name == "SKILLS_CHECKPOINTS":  # the service is started with it
+                with closing(Database.of(settings())) as database:
+                    sign_history(database)
             continue
         assert words[0] == "skills", command
         result = CliRunner().invoke(app, words[1:])
@@ -46,6 +57,26 @@ def test_every_command_of_the_page_runs_in_the_order_of_the_page(folder: Path, m
         ran.append(words[1])
     assert {"backup", "restore", "erasures", "verify"} == set(ran)
     assert (folder / "elsewhere" / "skills.sqlite").stat().st_size > 100_000
+
+
+@pytest.mark.parametrize("statements", SQL, ids=lambda text: text.split()[2])
+def test_sql_of_the_documents_leaves_a_whole_installation(tmp_path: Path, statements: str) -> None:
+    """Each is run as the sqlite3 program runs it, without enforced references, between two equal uses of all data."""
+    with serving(copy_of_told(tmp_path)) as service:
+        client, asked = service.client, {"surgeon": "kestrel", "suture": "simple-running"}
+        recordings = [(one["id"], one["duration_s"] - 0.1) for one in client.recordings()]
+
+        def used() -> list[object]:
+            cuts = [client.cut_demo(one, **asked, start_s=0.1, end_s=end_s)["sha256"] for one, end_s in recordings]
+            return [cuts, client.atlas("simple-running"), client.policy(**asked)]
+
+        before = used()
+        with sqlite3.connect(tmp_path / "skills.sqlite") as program:
+            program.executescript(statements)
+        program.close()
+        assert wrong(service.database) == []
+        assert used() == before
+        assert wrong(service.database) == []
 
 
 def test_restore_warns_without_a_list_and_refuses_beside_an_engine_file(
@@ -90,9 +121,19 @@ def test_commands_update_the_configured_list_and_a_restore_reads_it(
     assert json.loads(run(app, ["keys", "list", "--json"]).stdout)[0]["state"] == "revoked"
 
 
-def test_verify_exits_with_1_and_names_what_is_wrong(folder: Path) -> None:
-    import sqlite3
+def test_verify_writes_nothing(folder: Path) -> None:
+    with sqlite3.connect("skills.sqlite") as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        before = connection.execute("PRAGMA data_version").fetchone()
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(Database, "writing", None)
+            result = CliRunner().invoke(app, ["verify"])
+        assert (result.exit_code, result.output.count("WRONG")) == (0, 0), result.output
+        assert connection.execute("PRAGMA data_version").fetchone() == before
+    connection.close()
 
+
+def test_verify_exits_with_1_and_names_what_is_wrong(folder: Path) -> None:
     with sqlite3.connect("skills.sqlite") as connection:
         connection.execute("DROP TRIGGER policy_versions_append_only")
         connection.execute("UPDATE policy_versions SET manifest = replace(manifest, '\"seed\": 0', '\"seed\": 1')")

@@ -4,6 +4,7 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from math import inf
+from weakref import WeakValueDictionary
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
@@ -104,6 +105,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.metrics = ServiceMetrics(app.state.database, settings.lease_s)
     app.state.sessions = Sessions(app.state.database, app.state.served.changes, settings)
     app.state.metrics.sessions.set_function(lambda: app.state.sessions.places.count)
+    app.state.equal_uploads = WeakValueDictionary()  # of this moment, by route and digest
     app.state.downloads = CapacityLimiter(DOWNLOADS_READ)
     app.state.access = Access(app.state.database, settings)
     # `include_router` would analyse every route again, at the first request of each application: 90 ms.
@@ -135,17 +137,18 @@ def create_app(settings: Settings) -> FastAPI:
     return app
 
 
-def prepare_database(database: Database, settings: Settings) -> None:
-    """Migrate a database, seed its catalogue if it is empty, and sign its history.
+def prepare_database(database: Database, settings: Settings) -> bool:
+    """Migrate a database, seed its catalogue if it is empty, and sign its history; return whether it was migrated.
 
     Raises:
         NotReady: It is not the database that was signed last; nothing was changed.
     """
-    database.migrate()
+    migrated = database.migrate()
     database.compare_history()
     with database.writing() as session:
         seed_suture_types(session)
     sign_some_history(database)
+    return migrated
 
 
 def prepare_to_serve(database: Database, settings: Settings) -> None:

@@ -9,18 +9,24 @@ closed when its release is withdrawn, the surgeon's consent ends, the style is e
 watch for all sessions together, as `Watching` does for the streams of jobs. A message that is no pose is answered with
 `error`; one that is no JSON object closes the session. The codes 44xx are statuses of HTTP plus 4000.
 
+While the database cannot be read, so that a withdrawal would not be seen, messages are answered with `error`; if that
+lasts, the sessions are closed. Sessions are admitted as long as the processor has time for each at the full rate
+(`Capacity`); a late answer says how late it is, and where answers stay late, the youngest sessions are closed.
+
 The serving task of a session is the only one that sends. A watcher ends a session by cancelling that task, which then
 sends the reason: a client that does not read cannot hold up a watcher.
 """
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import date
 from functools import partial
-from time import monotonic
+from pathlib import Path
+from time import monotonic, thread_time
 from typing import Any
 
 import orjson
@@ -60,11 +66,21 @@ MOST = 400  # sessions of this process; 50 at 100 Hz take about a core
 WATCH_S = 0.2  # between two looks for changes of releases
 CALLER_S = 0.5  # for one check of each caller; a look-up of a key is cached for a second
 UNKNOWN_S = 1.5  # without an answer of the database for so long, a release may have been withdrawn
+UNREAD_S = 10.0  # and for so long, sessions are closed and not only held up
+LATE_S = 1 / RATE_HZ  # an answer that took longer is late
+STAYS_LATE_S = 2.0  # answers that are late for so long close sessions, the youngest first
+SHED = 4  # of the late sessions, one in so many is closed at once, so that the others are in time again
+LOOK_S = 0.02  # between two looks at the delay of the event loop
+WINDOW_S, WINDOWS = 1.0, 5  # in which the processor time of the event loop is measured, and new sessions are counted
+MESSAGE_S = 200e-6  # of processor time for a message, before any was measured
+SHARE = 0.35  # of a core, for sessions; beyond that, answers wait for each other
 CLOSE_S = 1.0  # for a client that does not read to take the reason
 AGAIN_S = 10.0
 WITHDRAWN, ERASED, FORBIDDEN, SIGNED_OUT, IDLE, FLOODED, BUSY = 4404, 4410, 4403, 4401, 4408, 4429, 4503
 NO_JSON, NO_TEXT = 1007, 1003  # of RFC 6455
 UNWATCHED = "The service cannot see a withdrawal; open the session again."
+LATE = f"Answers were later than {1000 * LATE_S:g} ms for {STAYS_LATE_S:g} s; open the session again in {AGAIN_S:g} s."
+UNREAD = "The database cannot be read now, so a withdrawal would not be seen: stop until there is a pose again."
 UNREADABLE = "The database cannot be read, so a withdrawal would not be seen; open the session again."
 
 
@@ -107,11 +123,14 @@ class Follower:
     ask_again: Callable[[], Awaitable[Caller]]
     credentials: Any  # of equal ones the caller is the same
     task: "asyncio.Task[Any]"
+    opened_s: float = field(default_factory=monotonic)
     heard_s: float = field(default_factory=monotonic)
+    known_s: float = field(default_factory=monotonic)  # when the last check of its caller began that was answered
     bucket: Bucket = field(default_factory=lambda: Bucket(BURST, REFILL_HZ))
     phase: int | None = None
     newer_version: int | None = None
     ended: tuple[int, str] | None = None
+    late_since_s: float | None = None  # the first of the late answers without one in time after it
 
     def end(self, code: int, reason: str) -> None:
         """Let its task send the reason and return."""
@@ -120,18 +139,26 @@ class Follower:
             self.task.cancel()
 
     async def refused(self) -> tuple[int, str] | None:
-        """Return why its caller may not use it any more, or None."""
+        """Return why its caller may not use it any more, or None.
+
+        Raises:
+            Busy: The database cannot be read.
+        """
         try:
             caller = await self.ask_again()
             caller.must_be("reader")
         except Busy:
-            return BUSY, UNREADABLE
+            raise
         except SkillsError:
             return SIGNED_OUT, "The key is revoked or expired."
         return None
 
-    def answer(self, text: str) -> bytes:
+    def answer(self, text: str, arrived_s: float) -> bytes:
         """Return the answer to a message.
+
+        Args:
+            text: The message.
+            arrived_s: When it arrived at the latest, of the monotonic clock.
 
         Raises:
             ValueError: It is not a JSON object, or repeats a name.
@@ -151,7 +178,54 @@ class Follower:
         except SkillsError as wrong:
             return orjson.dumps({"error": wrong.words()})
         self.phase = step.phase
-        return orjson.dumps(describe_step(poses, step) | {"newer_version": self.newer_version})
+        late_s = (at_s := monotonic()) - arrived_s
+        is_late = not late_s <= LATE_S
+        self.late_since_s = (self.late_since_s or at_s) if is_late else None
+        more = {"newer_version": self.newer_version, "late_ms": 1000 * late_s if is_late else None}
+        return orjson.dumps(describe_step(poses, step) | more)
+
+
+class Capacity:
+    """The processor time that the event loop has left for sessions, measured on its thread while there are some."""
+
+    def __init__(self) -> None:
+        self.lag_s = 0.0  # of the event loop: what has arrived may have waited for so long before it was read
+        self.messages = 0
+        self._message_s = MESSAGE_S
+        self._begin()
+
+    def _begin(self) -> None:
+        # What was admitted lately has hardly sent yet, and is no part of the load.
+        self._load, self._admitted = 0.0, deque([0] * WINDOWS, WINDOWS)
+
+    def admit(self) -> None:
+        """Count a new session, which may send at the full rate.
+
+        Raises:
+            TooMany: The processor has no time for it.
+        """
+        if not self._load + (sum(self._admitted) + 1) * RATE_HZ * self._message_s <= SHARE:
+            raise TooMany("The processor has no time for another session now; request single poses.", AGAIN_S)
+        self._admitted[-1] += 1
+
+    async def measure(self) -> None:
+        """Measure the delay of the event loop, and the processor time of its thread, until cancelled."""
+        began_s, before_s, before = monotonic(), _used_s(), self.messages
+        try:
+            while True:
+                due_s = monotonic() + LOOK_S
+                await asyncio.sleep(LOOK_S)
+                at_s = monotonic()
+                self.lag_s = max(at_s - due_s, 0.0)
+                if at_s - began_s > WINDOW_S:
+                    used_s, sent = _used_s() - before_s, self.messages - before
+                    self._load = used_s / (at_s - began_s)
+                    if sent > RATE_HZ:  # of fewer, other work would be counted as theirs
+                        self._message_s += 0.3 * (used_s / sent - self._message_s)
+                    self._admitted.append(0)
+                    began_s, before_s, before = at_s, _used_s(), self.messages
+        finally:
+            self._begin()
 
 
 class Sessions:
@@ -167,15 +241,18 @@ class Sessions:
         self._version: int | None = None  # of the database at the last look
         self._rows_seen: dict[Pinned, tuple[Any, ...] | None] | None = None  # and the rows that it judged
         self._known_s = 0.0  # when the last look began that was answered
+        self._capacity = Capacity()
 
     async def serve(self, socket: WebSocket, surgeon: str, suture: str) -> None:
         """Serve one session until it ends.
 
         Raises:
-            SkillsError: It is refused before it is opened: too many are open, or nothing is served.
+            SkillsError: It is refused before it is opened: too many are open, the processor has no time for it, or
+                nothing is served.
         """
         caller: Caller = socket.scope["caller"]
         with self.places.place(caller.key):
+            self._capacity.admit()
             began_s = monotonic()
             pinned = await to_thread.run_sync(_pin, self._database.seen_by(caller.only), surgeon, suture)
             task = asyncio.current_task()
@@ -215,8 +292,12 @@ class Sessions:
         elif follower.bucket.take(1.0) > 0:
             follower.end(FLOODED, f"At most {RATE_HZ:g} messages a second, and {BURST:g} at once.")
         else:
+            self._capacity.messages += 1
             try:
-                answer = follower.answer(text)
+                if self._unknown_s(follower) > UNKNOWN_S:
+                    answer = orjson.dumps({"error": UNREAD})
+                else:
+                    answer = follower.answer(text, message.get("arrived_s", monotonic()) - self._capacity.lag_s)
             except (ValueError, RecursionError):
                 follower.end(NO_JSON, "A message is one JSON object, without repeated names or NaN.")
             else:
@@ -224,9 +305,14 @@ class Sessions:
                 return
         await asyncio.sleep(0)  # the cancellation arrives here
 
+    def _unknown_s(self, follower: Follower) -> float:
+        """Return for how long the end of a release or a key may have gone unseen, in seconds."""
+        return monotonic() - min(self._known_s, follower.known_s)
+
     def _opening(self, pinned: Pinned) -> str:
         poses = pinned.poses
         limits = {"rate_hz": RATE_HZ, "burst": BURST, "message_bytes": MESSAGE_BYTES, "idle_s": self._idle_s}
+        limits |= {"late_ms": 1000 * LATE_S, "stays_late_s": STAYS_LATE_S}
         said = {
             **{"version": pinned.version, "sha256": pinned.sha256, "arm": poses.arm, "frame": poses.frame},
             **{"phases": len(poses.path.tip_mm), "tick_s": poses.tick_s, "tube": as_json(poses.tube)},
@@ -241,7 +327,8 @@ class Sessions:
         self._open.add(follower)
         if not self._watching:
             self._known_s = began_s
-            self._watching = [asyncio.create_task(self._watch_releases()), asyncio.create_task(self._watch_callers())]
+            tasks = (self._watch_releases(), self._watch_callers(), self._capacity.measure())
+            self._watching = [asyncio.create_task(one) for one in tasks]
             for one in self._watching:
                 one.add_done_callback(self._watched_no_more)
         try:
@@ -280,12 +367,22 @@ class Sessions:
                     self._version, self._known_s, self._rows_seen = version, began_s, rows
                     _tell(looking, found)
             for one in looking:
-                if monotonic() - self._known_s > UNKNOWN_S or self._database.history.refused is not None:
+                if self._unknown_s(one) > UNREAD_S or self._database.history.refused is not None:
                     one.end(BUSY, UNREADABLE)
                 elif one.pinned.last_day is not None and not consent.today() <= one.pinned.last_day:
                     one.end(FORBIDDEN, "The surgeon's consent has ended.")
                 elif monotonic() - one.heard_s > self._idle_s:
                     one.end(IDLE, f"No message for {self._idle_s:g} s.")
+            self._shed(monotonic())
+
+    def _shed(self, at_s: float) -> None:
+        """Close the youngest of the sessions whose answers stay late, so that those of the others are in time again."""
+        late = [one for one in self._open if one.late_since_s is not None and at_s - one.late_since_s > STAYS_LATE_S]
+        late.sort(key=lambda one: one.opened_s, reverse=True)
+        for one in late[: -(-len(late) // SHED)]:
+            one.end(BUSY, LATE)
+        for one in late:
+            one.late_since_s = at_s
 
     async def _rows(self, pinned: set[Pinned]) -> dict[Pinned, tuple[Any, ...] | None] | None:
         """Return all of which `_look` judges, read on the event loop; None where that takes longer than microseconds.
@@ -313,9 +410,25 @@ class Sessions:
             # One after the other: all at once would hold up the answers of every session.
             for same in callers.values():
                 await asyncio.sleep(CALLER_S / len(callers))
-                if (why := await same[0].refused()) is not None:
+                began_s = monotonic()
+                with suppress(Busy):
+                    why = await same[0].refused()
                     for one in same:
-                        one.end(*why)
+                        one.known_s = began_s
+                        if why is not None:
+                            one.end(*why)
+
+
+def _used_s() -> float:
+    """Return the time that this thread has run, and on Linux also that it has waited for a processor, in seconds.
+
+    With the second, a message costs more where other programs use the processors too.
+    """
+    try:
+        ran_ns, waited_ns, _ = Path("/proc/thread-self/schedstat").read_text().split()
+    except OSError:
+        return thread_time()
+    return (int(ran_ns) + int(waited_ns)) / 1e9
 
 
 def _credentials(scope: Scope) -> tuple[Any, ...]:

@@ -5,6 +5,7 @@ import hashlib
 import tempfile
 import time
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Annotated
 
 from fastapi import Depends, Header, Request
@@ -15,10 +16,30 @@ from skills.api.dependencies import Configured
 from skills.api.rate_limits import RateLimits
 from skills.errors import TooLarge, TooSlow, UnknownFormat, UnreadableRecording
 from skills.formats import BYTES, MEDIA_TYPES, media_type_of
-from skills.library.recordings.recordings import Upload, check_digest
+from skills.library.recordings.recordings import SharedReading, Upload, check_digest
 from skills.settings import Settings
 
 SPOOL_BYTES = 8 << 20
+
+
+class EqualUploads(SharedReading):
+    """Uploads of equal bytes to one route that are handled at once: the first is read, and the others wait for it.
+
+    They wait on the event loop and not in a thread, so that others are answered, however many they are.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._reading = asyncio.Lock()
+
+    @asynccontextmanager
+    async def one(self) -> AsyncIterator["EqualUploads"]:
+        """Wait until these bytes were read, or until it is this upload's turn to have them read."""
+        async with self._reading:
+            if self.outcome is None:
+                yield self
+                return
+        yield self
 
 
 async def receive(
@@ -62,7 +83,9 @@ async def receive(
         vouched = check_digest(content_digest, sha256)
         if media_type == BYTES:
             media_type = media_type_of(file)  # type: ignore[arg-type]
-        yield Upload(file, sha256, size, media_type, vouched)  # type: ignore[arg-type]
+        equal = request.app.state.equal_uploads.setdefault((request.url.path, sha256), EqualUploads())
+        async with equal.one() as shared:
+            yield Upload(file, sha256, size, media_type, vouched, shared=shared)  # type: ignore[arg-type]
 
 
 async def _in_time(request: Request, settings: Settings) -> AsyncIterator[bytes]:
@@ -87,4 +110,4 @@ async def _in_time(request: Request, settings: Settings) -> AsyncIterator[bytes]
         yield data
 
 
-Incoming = Annotated[Upload, Depends(receive)]
+Incoming = Annotated[Upload, Depends(receive, scope="function")]

@@ -73,7 +73,7 @@ def revoke(key: str) -> Answer:
     """
     from skills.library.people.keys import about_key, revoke_key
 
-    with _database() as database, database.writing() as session:
+    with _database() as database, database.ending() as session:
         about = about_key(revoke_key(session, key, "local"))
     return table(about, COLUMNS, rows=_with_surgeons(about))
 

@@ -93,8 +93,9 @@ def migrate() -> Answer:
     from skills.serving import prepare
     from skills.settings import settings
 
-    prepare(settings())
-    return outcome("The database is up to date.", up_to_date=True)
+    migrated = prepare(settings())
+    did = "The database was migrated" if migrated else "Nothing was to be migrated: the database is up to date"
+    return outcome(f"{did}.", up_to_date=True, migrated=migrated)
 
 
 @command(commands)
@@ -257,7 +258,6 @@ def verify(
         with bag.open("rb") as file:
             lines = verify_bag(file, None if key is None else read_key(key))
         return outcome("\n".join(lines), whole=True, checked=lines)
-    from skills.library.operation.history import sign_some_history
     from skills.library.operation.inspection import inspect_installation
     from skills.library.recordings.recordings import confined_reader
     from skills.settings import settings
@@ -266,7 +266,6 @@ def verify(
     found: dict[str, Checked] = {}
     with installation() as database, confined_reader(settings()) as reader, status_line("verifying") as update:
         heads = None if head is None else read_notes(head.read_text())
-        sign_some_history(database)
         for part in inspect_installation(
             database,
             reader.parse,

@@ -2,10 +2,10 @@
 
 import typer
 
-from skills.cli.commands import Surgeon, command
+from skills.cli.commands import Surgeon, Suture, command
 from skills.cli.connecting import service
 from skills.cli.output import Answer, table, text
-from skills.keywords import SurgeonKeywords
+from skills.keywords import SurgeonKeywords, SutureTypeKeywords
 
 commands = typer.Typer()
 surgeons = typer.Typer(no_args_is_help=True, help="Surgeons, by pseudonym; never by name.")
@@ -45,6 +45,13 @@ def surgeon_show(surgeon: Surgeon) -> Answer:
     """Show a surgeon."""
     with service() as client:
         return table(client.surgeon(surgeon), (*COLUMNS, "consent"))
+
+
+@command(sutures, "put")
+def suture_put(suture: Suture, about: SutureTypeKeywords) -> Answer:
+    """Create or replace a suture type; options that are left out are cleared."""
+    with service() as client:
+        return table(client.put_suture_type(suture, **about), ("suture", "name", "family"))
 
 
 @command(sutures, "list")

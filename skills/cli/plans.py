@@ -178,14 +178,7 @@ def play(
             (pictures / "joints.png").write_bytes(client.plot(playback.id, "joints"))
             (pictures / "clearance.png").write_bytes(client.plot(playback.id, "clearance"))
     assert playback.headline is not None, playback
-    sentences = [playback.headline.text]
-    for under in playback.report.estimate.under:
-        least = min(one.succeeds.lower for one in under.passes)
-        sentences.append(
-            f"{under.errors.name}: {under.errors.describe()}; every pass succeeds with a probability of at least "
-            f"{least:.3f} (95 %)"
-        )
-    return text(playback, *sentences, exit_code=0 if playback.feasible else 1)
+    return text(playback, playback.headline.text, *playback.headline.under, exit_code=0 if playback.feasible else 1)
 
 
 def arm_errors_of(errors: str | None) -> Any:

@@ -148,7 +148,7 @@ def _settings(option: str, settings: list[str]) -> dict[str, object]:
             found[name] = json.loads(value)
         except ValueError:
             example = "steps=100000" if option == "--setting" else "touch=100"
-            raise BadInput(f"{setting!r} is not a setting.", f"Write it as name=number, such as {example}") from None
+            raise BadInput(f"{setting!r} is not a setting.", f"Write it as name=value, such as {example}") from None
     return found
 
 

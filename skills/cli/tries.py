@@ -62,7 +62,7 @@ def try_bag(
     tool: Tool = None,
     as_json: AsJson = False,
 ) -> None:
-    """Take a bag to a verdict: read, cut, learn, certify, release if wanted, plan where it was demonstrated, and play.
+    """Take a bag to a verdict: read, cut, learn, certify, plan where it was demonstrated, play, release if wanted.
 
     Exit code 0 with the verdict of a feasible plan, 1 if it is not feasible or a step was refused, 3 if a question is
     open.
@@ -147,12 +147,13 @@ def _tried(client: "Client", printer: "_StepPrinter", job: "Job") -> "Job":
 
 def _exit_code(client: "Client", job: "Job") -> int:
     """Return the exit code of a try that has ended."""
-    last = _steps(job)[-1]
-    if last.state == "asks":
+    steps = {one.name: one for one in _steps(job)}
+    if any(one.state == "asks" for one in steps.values()):
         return OPEN
-    if job.state != "succeeded" or last.name != "verdict" or last.id is None:
+    verdict = steps.get("verdict")
+    if job.state != "succeeded" or verdict is None or verdict.id is None:
         return 1
-    return 0 if client.playback(last.id).feasible else 1
+    return 0 if client.playback(verdict.id).feasible else 1
 
 
 def _steps(job: "Job") -> "tuple[TryStep, ...]":

@@ -1,10 +1,9 @@
 """Calls of surgeons and of suture types."""
 
-from collections.abc import Sequence
 from typing import Unpack
 
 from skills.client.connection import Connection
-from skills.keywords import SurgeonKeywords
+from skills.keywords import SurgeonKeywords, SutureTypeKeywords
 from skills.schemas import SkillLevel
 from skills.schemas.people import Surgeon, SutureType
 
@@ -28,11 +27,8 @@ class People(Connection):
         """Erase a surgeon and everything derived from their data, permanently."""
         await self._request("DELETE", "/surgeons/{surgeon}", {"surgeon": surgeon})
 
-    async def put_suture_type(
-        self, suture: str, *, name: str, family: str, also_called: Sequence[str] = (), description: str = ""
-    ) -> SutureType:
-        """Create or replace a suture type."""
-        about = {"name": name, "family": family, "also_called": also_called, "description": description}
+    async def put_suture_type(self, suture: str, **about: Unpack[SutureTypeKeywords]) -> SutureType:
+        """Create or replace a suture type; fields that are left out are cleared."""
         return await self._ask(SutureType, "PUT", "/suture-types/{suture}", about, suture=suture)
 
     async def suture_type(self, suture: str) -> SutureType:

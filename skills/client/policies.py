@@ -49,7 +49,7 @@ class Policies(Connection):
         return await self._ask(Job, "POST", "/trainings", body, idempotent=not options.get("release"))
 
     async def try_recording(self, recording: str, surgeon: str, suture: str, **options: Unpack[TryKeywords]) -> Job:
-        """Request a stored recording's way to a verdict: cut, learnt, certified, released if wanted, planned, played.
+        """Request a stored recording's way to a verdict: cut, learnt, certified, planned, played, released if wanted.
 
         The job's result is a `TryResult` with the steps so far, also while it runs. The job ends with a question where
         one is open: send it again with one of the step's choices, whose `change` has keywords of this call.

@@ -6,11 +6,13 @@ assume to be stored, and a second fsync would report success. So the process exi
 process reads what is really stored (Rebello et al., "Can Applications Recover from fsync Failures?", USENIX ATC 2020).
 """
 
+import fcntl
 import logging
 import os
 import sqlite3
 import stat
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -29,7 +31,58 @@ _HARMLESS = (
     *(sqlite3.SQLITE_IOERR_CHECKRESERVEDLOCK, sqlite3.SQLITE_IOERR_ACCESS, sqlite3.SQLITE_IOERR_GETTEMPPATH),
 )
 
+# Ours: a step of an erasure writes 4 MiB of content to the write-ahead log; a withdrawal writes some 100 KiB.
+RESERVE_BYTES, RESERVE_STEP_BYTES = 8 << 20, 256 << 10
+
 log = logging.getLogger(__name__)
+
+
+class Reserve:
+    """Allocated space beside a SQLite file, so that something can be withdrawn or erased on a disk that others filled.
+
+    The lock on its file lasts from the release of the space to its allocation, so that no process allocates it again
+    while a transaction of another one uses it.
+    """
+
+    def __init__(self, database: Path) -> None:
+        """Name the file; nothing is allocated yet."""
+        self._file = Path(f"{database}.reserve")
+
+    def allocate(self) -> None:
+        """Allocate what is missing, as far as there is space, unless it is in use."""
+        with suppress(BlockingIOError), self._locked(fcntl.LOCK_EX | fcntl.LOCK_NB):
+            pass
+
+    @contextmanager
+    def released(self) -> Iterator[None]:
+        """Release the space for the duration of the block if the disk has less than that left.
+
+        A caller that writes to the database has its write lock already: others that write to it get nothing.
+        """
+        with self._locked(fcntl.LOCK_EX) as handle:
+            left = os.fstatvfs(handle)
+            if left.f_bavail * left.f_frsize < RESERVE_BYTES:
+                os.ftruncate(handle, 0)
+            yield
+
+    @contextmanager
+    def _locked(self, how: int) -> Iterator[int]:
+        handle = os.open(self._file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(handle, how)
+            try:
+                yield handle
+            finally:
+                _allocate(handle)
+        finally:
+            os.close(handle)
+
+
+def _allocate(handle: int) -> None:
+    """Allocate the rest of a file up to `RESERVE_BYTES`, in steps, so that a fuller disk gives some of it."""
+    with suppress(OSError):  # it is full: a later transaction takes the rest
+        for at in range(os.fstat(handle).st_size, RESERVE_BYTES, RESERVE_STEP_BYTES):
+            os.posix_fallocate(handle, at, RESERVE_STEP_BYTES)
 
 
 def make_private(database: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from sqlalchemy import URL, Connection, Dialect, Engine, create_engine, event
 from sqlalchemy.engine import make_url
 from sqlalchemy.engine.interfaces import DBAPIConnection
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, OperationalError
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from skills.db.change_notes import FORGET_NOTES, NOTING, NOTING_CONNECTION
@@ -111,9 +111,9 @@ def open_engine(url: str, patience_ms: int) -> Engine:
 def _forgotten(connection: Connection) -> bool:
     """Delete the notes for the history that others have left; return whether there is a history."""
     try:
-        connection.connection.cursor().execute(FORGET_NOTES)
-    except sqlite3.OperationalError as error:
-        if "no such table" not in str(error):
+        connection.exec_driver_sql(FORGET_NOTES)
+    except OperationalError as error:
+        if "no such table" not in str(error.orig):
             raise
         return False
     return True

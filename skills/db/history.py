@@ -30,7 +30,7 @@ from skills.db.leaves import (
     removals,
 )
 from skills.db.logged_rows import logged, schema_of
-from skills.db.saved_heads import archive_heads, heads_file_for, last_head
+from skills.db.saved_heads import ANOTHER, archive_heads, heads_file_for, last_head
 from skills.errors import BadSettings, Corrupt, NotReady
 from skills.remedies import Action, Remedy
 from skills.transparency.merkle import HASH_BYTES, Checkpoint, Tree, leaf_hash
@@ -54,6 +54,12 @@ class History:
         """Name the database, the file of the key, and that of the saved heads; they are read at the first use."""
         self._engine = engine
         self.key_file = key_file
+        if heads_file is not None and not heads_file.parent.is_dir():
+            raise BadSettings(
+                f"The folder {heads_file.parent} of SKILLS_CHECKPOINTS does not exist, so no head could be saved.",
+                "Make it, or mount its disk.",
+                ANOTHER,
+            )
         self.heads_file = heads_file or heads_file_for(key_file, engine.url)
         self._why: tuple[str, *tuple[str | Remedy, ...]] | None = None  # nothing is served or written
         self._agreed: tuple[str | None, Note | None] | None = None  # the newest checkpoint, and the saved head

@@ -20,7 +20,7 @@ and releases are identified by their content, so a repeated one is found or stor
 import logging
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from copy import copy
 from pathlib import Path
 from typing import Self
@@ -31,7 +31,7 @@ from sqlalchemy.exc import DatabaseError, DBAPIError, OperationalError, TimeoutE
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from skills.db.disk import POSTGRESQL_FAILED, is_full
+from skills.db.disk import POSTGRESQL_FAILED, Reserve, is_full
 from skills.db.engines import BUSY_TIMEOUT_MS, SPELLING, UNUSABLE, lock_number, open_engine
 from skills.db.history import HISTORY, History
 from skills.db.leaves import CHECKPOINTS
@@ -82,6 +82,8 @@ class Database:
             self.engine, signing_key or settings().signing_key, checkpoints or settings().checkpoints
         )
         self._sessions = sessionmaker(self.engine, expire_on_commit=False, info={HISTORY: self.history})
+        file = self.engine.url.database if self.engine.dialect.name == "sqlite" else None
+        self._reserve = None if file is None else Reserve(Path(file))
         self._condition: tuple[Callable[[Session], None], Sequence[str]] = (lambda _: None), ()
 
     @classmethod
@@ -94,6 +96,15 @@ class Database:
     def reading(self) -> Iterator[Session]:
         """Open a session that reads one consistent state."""
         with translating_errors(self.engine.url), self._sessions() as session:
+            yield session
+
+    @contextmanager
+    def ending(self, names: Iterable[str] | None = None) -> Iterator[Session]:
+        """Open a session as `writing` does, to withdraw, revoke or erase: on SQLite it succeeds on a full disk too."""
+        with ExitStack() as after, self.writing(names) as session:
+            session.connection()  # takes the write lock
+            if self._reserve is not None:
+                after.enter_context(self._reserve.released())  # and allocated again after the commit
             yield session
 
     @contextmanager
@@ -145,8 +156,11 @@ class Database:
         checked._condition = check, names
         return checked
 
-    def migrate(self) -> None:
+    def migrate(self) -> bool:
         """Migrate the tables to this version, from an empty database or any older version since 0.3.0.
+
+        Returns:
+            Whether that changed anything.
 
         Raises:
             NotReady: They would be changed, and it is not the database that was signed last.
@@ -169,16 +183,23 @@ class Database:
         if before != revisions()[0] and self.engine.dialect.name == "postgresql":
             with self.writing() as session:
                 session.execute(text(LOG_SEQUENCES))
+        self.reserve_space()
+        return before != revisions()[0]
+
+    def reserve_space(self) -> None:
+        """Allocate the space that `ending` uses on a full disk; on PostgreSQL the operator provides it."""
+        if self._reserve is not None:
+            self._reserve.allocate()
 
     def forget(self) -> None:
         """Remove deleted data from SQLite's write-ahead log; call it after the commit.
 
         It waits for readers of the log, up to the busy timeout; after that the data stay in the log until it is reused.
         """
-        if self.engine.dialect.name != "sqlite":
+        if self._reserve is None:
             return  # PostgreSQL's vacuum does it
         engine = self.engine.execution_options(isolation_level="AUTOCOMMIT")
-        with translating_errors(self.engine.url), engine.connect() as connection:
+        with translating_errors(self.engine.url), engine.connect() as connection, self._reserve.released():
             connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def close(self) -> None:

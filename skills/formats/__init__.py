@@ -188,7 +188,7 @@ def _format_of_text(head: bytes) -> FileFormat:
         if b"\0" not in head and has_separator(head.split(b"\n", 1)[0].decode("latin-1")):
             raise UnknownFormat(
                 "The table is text, and not in UTF-8: spreadsheets write Windows-1252 as well. Save it as UTF-8, or "
-                "convert it: iconv -f WINDOWS-1252 -t UTF-8 TABLE.csv > UTF8.csv"
+                "convert it (iconv -f WINDOWS-1252 -t UTF-8 TABLE.csv > UTF8.csv)."
             ) from None
         raise UnknownFormat(f"The content is neither a recording nor UTF-8 text. {_READ}") from None
     # Markup, JSON and binary data are refused here: the table reader would only complain about columns.

@@ -230,7 +230,7 @@ def _check_no_log_is_missing(paths: Sequence[Path]) -> None:
                 raise UnreadableRecording(
                     "The SQLite bag (.db3) is in WAL mode: its last messages may be in the file with the suffix -wal "
                     "that was beside it and is not here. Send the whole folder as a zip. If the recorder closed the "
-                    "bag and left no such file, say so to SQLite: sqlite3 BAG.db3 'PRAGMA journal_mode=DELETE'"
+                    "bag and left no such file, say so to SQLite (sqlite3 BAG.db3 'PRAGMA journal_mode=DELETE')."
                 )
 
 

@@ -40,6 +40,7 @@ from skills.settings import Settings
 if TYPE_CHECKING:
     from dbos import DBOSClient, DBOSConfig
 
+ADOPTED = "recorded outcome"  # end of the engine's message about a job that was cancelled or taken over
 APPLICATION = "suture-skills"
 # Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and pictures and exports are of low priority.
 JOBS, BATCHES, LOW_PRIORITY = "jobs", "batches", "low-priority"
@@ -88,6 +89,7 @@ def _system(settings: Settings) -> Any:
     """Return the settings of the engine's database, with `Clock` if it is a SQLite file."""
     from dbos import DBOSPortableJSONSerializer
 
+    log_faults_alone()
     url = make_url(settings.engine_url)
     if url.get_backend_name() == "sqlite":
         url = url.update_query_pairs([("plugin", CLOCK)])
@@ -96,6 +98,22 @@ def _system(settings: Settings) -> Any:
         "dbos_system_schema": "dbos",
         "serializer": DBOSPortableJSONSerializer(),  # the default is pickle, which can execute stored bytes
     }
+
+
+def log_faults_alone() -> None:
+    """Leave out of the engine's log what is no fault, and keep it from adding a handler of its own."""
+    engine = logging.getLogger("dbos")
+    engine.addHandler(logging.NullHandler())
+    engine.addFilter(_fault)
+
+
+def _fault(record: logging.LogRecord) -> bool:
+    """Return whether a record of the engine is of a fault.
+
+    A job that a user cancels while it runs is none, and of a job that was taken over `skills.jobs.workflows` logs it.
+    """
+    error = record.exc_info[1] if record.exc_info else None
+    return not (type(error).__name__ == "DBOSAwaitedWorkflowCancelledError" or str(record.msg).endswith(ADOPTED))
 
 
 def prepare(settings: Settings) -> None:

@@ -139,9 +139,12 @@ class Headline(Given):
             surely succeeds in less than half of the worlds.
         word: The level in a word or two.
         errors: Name of the errors of the arms: those of the playback's request, or else of the installation.
-        probability: Of the whole plan; null where it was not judged.
+        probability: Of the whole plan; null where it was not judged, and where the plan is not feasible.
         counts: The event of the probability: the needle is handed over in every pass, or, without a hand-off, the
-            motion only stays within reach and clear; null where it was not judged.
+            motion only stays within reach and clear; null without a probability.
+        event: That event in words; null without a probability.
+        estimate: The probability as a sentence, with its event, its worlds and what it leaves out.
+        under: A sentence on each of the errors of the arms under which the passes were judged.
         not_judged: What the probability leaves out, in words.
         costs_most: The error that costs the most, in words; null where none was judged.
     """
@@ -152,6 +155,9 @@ class Headline(Given):
     errors: str
     probability: Probability | None
     counts: CountedEvent | None
+    event: str | None
+    estimate: str | None
+    under: list[str]
     not_judged: list[str]
     costs_most: str | None
 

@@ -90,9 +90,12 @@ class SessionPose(PoseAnswer):
 
     Attributes:
         newer_version: Another version that was released since; the session keeps its own.
+        late_ms: How long the pose waited in the service, if longer than `limits.late_ms`; otherwise null. An answer
+            after its tick is worse for a robot than none.
     """
 
     newer_version: int | None
+    late_ms: float | None
 
 
 class SessionLimits(Given):
@@ -101,12 +104,16 @@ class SessionLimits(Given):
     Attributes:
         burst: Messages at once.
         idle_s: Without a message for so long it is closed.
+        late_ms: A pose that took longer says how long.
+        stays_late_s: Poses that are late for so long close sessions, the youngest first.
     """
 
     rate_hz: float
     burst: float
     message_bytes: int
     idle_s: float
+    late_ms: float
+    stays_late_s: float
 
 
 class SessionOpening(PolicyName):

@@ -12,8 +12,9 @@ from skills.schemas.requests import FRAME, Coordinate, Number, PointIn, Schema, 
 
 
 def settings_schema(of: type[Learner] | type[SceneCosts], name: str, **more: Any) -> Any:
-    """Return a schema with the numbers of a settings class; the class itself checks their values."""
-    settings: dict[str, Any] = {f.name: (Whole if f.type is int else Number, f.default) for f in fields(of)}
+    """Return a schema with the settings of a class, numbers or words of a `Literal`; the class checks their values."""
+    kinds: dict[Any, Any] = {int: Whole, float: Number}
+    settings: dict[str, Any] = {f.name: (kinds.get(f.type, f.type), f.default) for f in fields(of)}
     return create_model(name, __base__=Schema, __doc__=of.__doc__, **settings, **more)
 
 

@@ -56,7 +56,7 @@ RADIUS_MM = 0.33  # of the needle's wire
 # The arc from the place where it is held, two thirds from the tip: x along the needle, y towards the arc's centre.
 _TURN = np.linspace(-pi / 3, 2 * pi / 3, 49)
 ARC_BULGE_MM = NEEDLE_RADIUS_MM * (1 - cos((_TURN[1] - _TURN[0]) / 2))  # of the wire beyond the chord of two points
-_ARC_MM: Floats = NEEDLE_RADIUS_MM * np.stack([np.sin(_TURN), 1 - np.cos(_TURN), np.zeros_like(_TURN)], axis=1)
+ARC_MM: Floats = NEEDLE_RADIUS_MM * np.stack([np.sin(_TURN), 1 - np.cos(_TURN), np.zeros_like(_TURN)], axis=1)
 
 
 def travel_mm(joints: Floats, instrument: str) -> Floats:
@@ -302,13 +302,13 @@ def needle_poses(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
         The place where it is held, mm in the PSM_A base frame, shape (F, 3), and the rotation of its frame, shape (F,
         3, 3).
     """
-    place, rotation = _in_jaws_of_psm_a(trajectory, at)
+    place, rotation = needle_in_psm_a(trajectory, at)
     away = (trajectory.phase[at] == TRANSFER) & (trajectory.pass_index[at] > 0)
     if trajectory.psm_m is None or not away.any():
         return place, rotation
     taken = trajectory.last_samples[trajectory.pass_index[at[away]] - 1]
     (tip, jaws), (tip_then, jaws_then) = psm_m_poses(trajectory, at[away]), psm_m_poses(trajectory, taken)
-    place_then, rotation_then = _in_jaws_of_psm_a(trajectory, taken)
+    place_then, rotation_then = needle_in_psm_a(trajectory, taken)
     turned = jaws @ np.swapaxes(jaws_then, 1, 2)
     place[away] = tip + np.einsum("fij,fj->fi", turned, place_then - tip_then)
     rotation[away] = turned @ rotation_then
@@ -325,8 +325,8 @@ def needle_arc_mm(trajectory: Trajectory, at: Ints) -> Floats:
     Returns:
         Points in mm in the PSM_A base frame, shape (F, 49, 3).
     """
-    place, rotation = _in_jaws_of_psm_a(trajectory, at)
-    return np.asarray(place[:, None] + np.einsum("fij,kj->fki", rotation, _ARC_MM))
+    place, rotation = needle_in_psm_a(trajectory, at)
+    return np.asarray(place[:, None] + np.einsum("fij,kj->fki", rotation, ARC_MM))
 
 
 def needle_travel_mm(trajectory: Trajectory) -> Floats:
@@ -340,7 +340,7 @@ def needle_travel_mm(trajectory: Trajectory) -> Floats:
     """
     tool, moved = instrument_of(trajectory.instrument), np.abs(np.diff(trajectory.joints, axis=0))
     wrist = np.abs(trajectory.joints[:, INSERTION] - tool.wrist_offset_mm)
-    reach = float(np.hypot(HELD_MM, np.linalg.norm(_ARC_MM, axis=1).max()) + RADIUS_MM)
+    reach = float(np.hypot(HELD_MM, np.linalg.norm(ARC_MM, axis=1).max()) + RADIUS_MM)
     deep = np.maximum(wrist[1:], wrist[:-1]) + WRIST_MM + reach
     turned = (moved[:, 0] + moved[:, 1]) * deep + (moved[:, 3] + moved[:, 4]) * (WRIST_MM + reach)
     return np.asarray(turned + moved[:, 2] + moved[:, 5] * reach)
@@ -355,7 +355,7 @@ def needle_to_pad_mm(trajectory: Trajectory, at: Ints, pad_mm: Floats) -> Floats
         pad_mm: The middle of the pad's top in the PSM_A base frame, shape (3,).
     """
     place, rotation = needle_poses(trajectory, at)
-    arc = place[:, None] + np.einsum("fij,kj->fki", rotation, _ARC_MM)
+    arc = place[:, None] + np.einsum("fij,kj->fki", rotation, ARC_MM)
     half = pad_scale(trajectory.tip_mm) * np.array(PAD_SIZE_MM) / 2
     beyond = np.abs(arc - pad_mm + [0.0, 0.0, half[2]]) - half  # signed distance from each pair of the pad's faces
     outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=2)
@@ -377,7 +377,7 @@ def psm_m_poses(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
     return poses.tip_mm, poses.rotation
 
 
-def _in_jaws_of_psm_a(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
+def needle_in_psm_a(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
     """Return the needle's pose along the hinge of PSM_A's jaws, its free end on PSM_M's side, as in `hand_off`."""
     jaws = matrix_of(trajectory.rotation_xyzw[at])
     place = trajectory.tip_mm[at] + HELD_MM * jaws[:, :, 2]

@@ -166,9 +166,10 @@ class Limits:
 @schema
 @dataclass(frozen=True)
 class Failure:
-    """The first sample that is not allowed.
+    """The first sample that is not allowed, and the worst one of the same quantity.
 
-    `quantity` names PSM_M if the sample fails because of it, and the links that are too near.
+    `quantity` names PSM_M if the sample fails because of it, and the links that are too near. `value` is that of the
+    first sample, `worst` the furthest from the limit of all, at `worst_s`; null where one is no number.
     """
 
     sample: Count
@@ -179,12 +180,16 @@ class Failure:
     value: Figure
     limit: float
     unit: str
+    worst: Figure
+    worst_s: float
 
     def __str__(self) -> str:
-        """Return the failure as a sentence."""
+        """Return the failure as a sentence, with its worst value if that is another."""
+        value, worst = ("no number" if one is None else f"{one:.4g} {self.unit}" for one in (self.value, self.worst))
+        at_worst = "" if worst == value else f"; at worst it is {worst}, at {self.worst_s:.3f} s"
         return (
             f"Pass {self.pass_index}, {PHASES[self.phase]}, sample {self.sample} ({self.stamp_s:.3f} s): "
-            f"{self.quantity} is {self.value:.4g} {self.unit}, the limit is {self.limit:.4g}."
+            f"{self.quantity} is {value}, the limit is {self.limit:.4g}{at_worst}."
         )
 
 
@@ -200,9 +205,16 @@ class _Gate:
 
     def broken(self) -> int | None:
         """Return the index of the first sample that does not pass, or None; NaN, or within `TOLERANCE`, does not."""
-        beyond = self.values - self.limit if self.at_least else self.limit - self.values
-        passes = beyond >= TOLERANCE
+        passes = self._beyond >= TOLERANCE
         return None if passes.all() else int(np.argmin(passes))
+
+    def worst(self) -> int:
+        """Return the index of the sample that is furthest from the limit; NaN before all."""
+        return int(np.nan_to_num(self._beyond, nan=-np.inf).argmin())
+
+    @property
+    def _beyond(self) -> Floats:
+        return self.values - self.limit if self.at_least else self.limit - self.values
 
 
 def first_failure(
@@ -241,6 +253,7 @@ def first_failure(
     if not broken:
         return None
     sample, gate = min(broken, key=lambda one: one[0])
+    worst = gate.worst()
     return Failure(
         sample=sample,
         pass_index=int(trajectory.pass_index[sample]),
@@ -250,6 +263,8 @@ def first_failure(
         value=float(gate.values[sample]),
         limit=gate.limit,
         unit=gate.unit,
+        worst=float(gate.values[worst]),
+        worst_s=float(trajectory.stamps_s[worst]),
     )
 
 

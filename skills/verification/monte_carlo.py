@@ -12,8 +12,10 @@ A *variation* of a pass draws the errors of `skills.verification.arm_errors`, in
   through the grip.
 
 A variation is *clear* if every checked pose of the pass keeps to the playback's limits: joints, cannula, pad, and the
-other arm with its outer bodies, if its place is known; fingers may touch fingers at the hand-off itself, where both
-arms stand and only the jaws move. Speeds are not judged: a plan made for the shifted point has its own.
+other arm with its outer bodies, if its place is known; and if the needle stays out of tissue once it has come out. The
+tissue beside each pose is taken to be even, as far from the needle as in the scene. Fingers may touch fingers at the
+hand-off itself, where both arms stand and only the jaws move. Speeds are not judged: a plan made for the shifted point
+has its own.
 
 The needle is *caught* if its arc crosses the plane in which PSM_M's fingers close, at the end of A2, within the sector
 that they sweep, with needle to spare on both sides of them, and its tangent there is within the stated angle of their
@@ -134,6 +136,8 @@ class PlannedPass:
         phase: Phase of each sample, shape (S,).
         pad_top_mm: Height of the pad's top along its normal in the PSM_A base frame; -inf: there is no pad.
         stamps_s: Time of each sample, shape (S,).
+        needle: The needle's rotation in PSM_A's jaws, as planned, shape (S, 3, 3).
+        needle_mm: Its distance from tissue there, shape (S,); infinite where it is not judged.
         taking: The recorded pose in which PSM_M takes the needle, in that frame; None: that of the paper's A2.
         pad_normal: Unit direction out of the pad in that frame.
     """
@@ -142,6 +146,8 @@ class PlannedPass:
     phase: Bytes
     pad_top_mm: float
     stamps_s: Floats
+    needle: Floats
+    needle_mm: Floats
     taking: Pose | None = None
     pad_normal: Point = UPWARDS
 
@@ -154,7 +160,12 @@ class PlannedPass:
 
 
 def scene_of(
-    trajectory: Trajectory, number: int, pad_top_mm: float, opening_rad: float, pad_normal: Point = UPWARDS
+    trajectory: Trajectory,
+    number: int,
+    pad_top_mm: float,
+    opening_rad: float,
+    pad_normal: Point = UPWARDS,
+    needle_mm: Floats | None = None,
 ) -> PlannedPass:
     """Return a pass with all its samples.
 
@@ -164,6 +175,8 @@ def scene_of(
         pad_top_mm: Height of the pad's top along its normal in the PSM_A base frame.
         opening_rad: Opening of each of PSM_M's fingers if the motion states no angle of its jaw.
         pad_normal: Unit direction out of the pad.
+        needle_mm: The needle's distance from tissue in each sample of the trajectory, shape (T,), infinite where it is
+            not judged; None: nowhere.
     """
     samples = np.flatnonzero(trajectory.pass_index == number)
     arms = []
@@ -175,7 +188,9 @@ def scene_of(
     recorded = trajectory.taking
     taking = None if recorded is None else Pose(recorded.tip_mm[number], recorded.rotation[number])
     phase, stamps_s = trajectory.phase[samples], trajectory.stamps_s[samples]
-    return PlannedPass(tuple(arms), phase, pad_top_mm, stamps_s, taking, pad_normal)
+    rotation = clearance.needle_in_psm_a(trajectory, samples)[1]
+    apart_mm = np.full(len(samples), inf) if needle_mm is None else needle_mm[samples]
+    return PlannedPass(tuple(arms), phase, pad_top_mm, stamps_s, rotation, apart_mm, taking, pad_normal)
 
 
 def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
@@ -190,7 +205,7 @@ def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
     """
     seen = [arm.links(arm.joints) for arm in scene.arms]
     margins = [clearance.clearance_to_pad(one, scene.pad_top_mm, scene.pad_normal).min(axis=1) for one in seen]
-    margins += [arm.margins(arm.joints).min(axis=1) for arm in scene.arms]
+    margins += [scene.needle_mm, *(arm.margins(arm.joints).min(axis=1) for arm in scene.arms)]
     if len(seen) == 2:
         margins.append(_apart(seen[0], seen[1], scene.handing_over))
     moved = sum(clearance.travel_mm(arm.joints, arm.instrument)[:, 1:].max(axis=1) for arm in scene.arms)
@@ -202,7 +217,8 @@ def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
     least = [begin + int(values[begin : end + 1].argmin()) for values in margins for begin, end in spans]
     samples = np.unique(np.concatenate([begins, ends, least]))
     arms = tuple(arm.at(samples) for arm in scene.arms)
-    return replace(scene, arms=arms, phase=scene.phase[samples], stamps_s=scene.stamps_s[samples])
+    some = {name: getattr(scene, name)[samples] for name in ("phase", "stamps_s", "needle", "needle_mm")}
+    return replace(scene, arms=arms, **some)
 
 
 def spoiled(
@@ -344,6 +360,7 @@ def estimate_success(
     approach_m: ArrayLike | None,
     pad_top_mm: float | None,
     pad_normal: Point = UPWARDS,
+    needle_mm: Floats | None = None,
     errors: ArmErrors = UNCALIBRATED,
     seed: int = 0,
     settings: EstimateSettings | None = None,
@@ -358,6 +375,8 @@ def estimate_success(
         pad_top_mm: Height of the pad's top along its normal in the PSM_A base frame; the pad is assumed to be infinite.
             None: there is no pad, and nothing is compared with one.
         pad_normal: Unit direction out of the pad, such as that of sloping tissue.
+        needle_mm: The needle's distance from tissue in each sample, shape (T,), infinite where it is not judged, as
+            `skills.verification.scene_clearance` has it; None: it is compared with none.
         errors: The stated errors of the arms. Those of both defaults are judged beside them.
         seed: Seed of the random numbers.
         settings: The other errors to draw, and the conditions of a catch.
@@ -379,10 +398,15 @@ def estimate_success(
         raise BadSettings("A seed must be 0 or more.", seed=seed)
     varied, allowed = settings or EstimateSettings(), limits or Limits()
     top_mm = -inf if pad_top_mm is None else float(pad_top_mm)
-    scenes = [scene_of(trajectory, k, top_mm, varied.opening_rad, pad_normal) for k in range(trajectory.passes)]
+    scenes = [
+        scene_of(trajectory, k, top_mm, varied.opening_rad, pad_normal, needle_mm) for k in range(trajectory.passes)
+    ]
     thin = [looked_at(scene, varied.stretches) for scene in scenes]
     under = [errors, *(one for one in (CALIBRATED, UNCALIBRATED) if one != errors)]
-    spared = [size for size in CALLED if getattr(errors, size) > 0]
+    one_arm = trajectory.psm_m is None and trajectory.taking is None and approach_m is None
+    spared = [
+        size for size in CALLED if getattr(errors, size) > 0 and not (one_arm and size.startswith("registration"))
+    ]
     sizes = {"suture_point_mm": varied.suture_point_mm, "needle_rad": varied.needle_rad}
     draws = [draw(seed, k, varied.variations, len(scene.phase), **sizes) for k, scene in enumerate(thin)]
     without = [errors.without(size) for size in spared]
@@ -391,7 +415,12 @@ def estimate_success(
         strict=True,
     )
     whole = np.logical_and.reduce(succeeds)
-    costs = [Cost(size, share(~good)) for size, good in zip([*spared, NEEDLE], whole, strict=False)]
+    # The needle's angle costs nothing where nothing is judged of the needle.
+    judged = {name for one in faults for name in one} & {"needle", *AT_THE_END}
+    costs = [
+        Cost(size, share(~good))
+        for size, good in zip([*spared, NEEDLE][: len(spared) + bool(judged)], whole, strict=False)
+    ]
     return SuccessEstimate(
         seed=seed,
         pad_top_mm=None if pad_top_mm is None else top_mm,
@@ -431,12 +460,15 @@ def _judged(
     displaced = [drawn.under(one, scene.stamps_s) for one in [*under, *spared]]
     arms = at_hand_off(scene, approach_m, varied.unknown_depth_mm)
     missed: dict[str, Flags] = {}
+    unturned = np.broadcast_to(np.eye(3), drawn.turned.shape)
     upright = np.zeros(len(drawn.shift_mm), dtype=bool)  # the stated errors, with a needle that stands as planned
+    if scene.pad_top_mm > -inf:
+        missed["needle"] = in_tissue(scene, displaced, drawn.turned)
+        (upright,) = in_tissue(scene, displaced[:1], unturned)
     if arms is not None:
         caught = [caught_by(arms, drawn.shift_mm, one, drawn.turned, varied) for one in displaced]
-        missed = {name: ~np.array(one) for name, one in zip(AT_THE_END, zip(*caught, strict=True), strict=True)}
-        unturned = np.broadcast_to(np.eye(3), drawn.turned.shape)
-        upright = ~np.logical_and(*caught_by(arms, drawn.shift_mm, displaced[0], unturned, varied))
+        missed |= {name: ~np.array(one) for name, one in zip(AT_THE_END, zip(*caught, strict=True), strict=True)}
+        upright |= ~np.logical_and(*caught_by(arms, drawn.shift_mm, displaced[0], unturned, varied))
     lost = np.logical_or.reduce([np.zeros((len(displaced), len(upright)), dtype=bool), *missed.values()])
     wanted = ~lost
     wanted[: len(under)] = True  # of these every fault is counted; of the others success alone
@@ -445,6 +477,39 @@ def _judged(
     good = ~(lost | spoilt)[len(under) :]
     faults = {name: one[: len(under)] for name, one in (found | missed).items()}
     return faults, np.concatenate([good, ~(upright | spoilt[0])[None]])
+
+
+def in_tissue(scene: PlannedPass, displaced: Sequence[Displaced], turned: Floats) -> Flags:
+    """Return whether the needle is in tissue in N variations, each with E displacements of the arms; NaN is.
+
+    The shift of the suture point moves tissue and needle alike. A pose is evaluated only where the errors could take
+    the needle as far as the tissue.
+
+    Args:
+        scene: The pass in the samples to check.
+        displaced: The E displacements of the N variations.
+        turned: Rotation of the needle about PSM_A's grip, shape (N, 3, 3).
+
+    Returns:
+        Shape (E, N).
+    """
+    found = np.zeros((len(displaced), len(turned)), bool)
+    judged = np.flatnonzero(~(scene.needle_mm == inf))
+    apart_mm, needle, normal = scene.needle_mm[judged], scene.needle[judged], np.array(scene.pad_normal)
+    held_mm = HELD_MM * scene.arms[0].rotation[judged][:, :, 2]
+    low_mm = (normal @ needle @ clearance.ARC_MM.T).min(axis=1)
+    reach_mm = float(np.linalg.norm(clearance.ARC_MM, axis=1).max())
+    askew_mm = reach_mm * np.linalg.norm(turned - np.eye(3), axis=(1, 2))
+    for one, errors in zip(found, displaced, strict=True):
+        tip_mm, jaw_rad = errors.tip_mm[0][:, judged], errors.jaw_rad[0]
+        most_mm = np.linalg.norm(tip_mm, axis=2) + (askew_mm + jaw_rad * (HELD_MM + reach_mm))[:, None]
+        variation, at = np.nonzero(~(apart_mm - most_mm >= 0))
+        jaw = errors.jaw_turn[0, variation]
+        moved_mm = (tip_mm[variation, at] + np.einsum("rij,rj->ri", jaw, held_mm[at]) - held_mm[at]) @ normal
+        there = jaw @ turned[variation] @ needle[at]
+        lowest_mm = (normal @ there @ clearance.ARC_MM.T).min(axis=1) - low_mm[at]
+        one[variation[~(apart_mm[at] + moved_mm + lowest_mm >= 0)]] = True
+    return found
 
 
 def at_hand_off(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: float) -> tuple[Planned, Planned] | None:

@@ -19,7 +19,7 @@ from skills.verification.gates import Limits
 
 JUDGE_VERSION = 1  # raise it when the same plan would be judged otherwise
 UPWARDS = (0.0, 0.0, 1.0)
-ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms", "bodies"), ("place", "angle")
+ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms", "bodies", "needle"), ("place", "angle")
 NEEDLE = "needle"  # of a `Cost`: the needle's angle in the jaws, which is no error of the arms
 
 
@@ -81,6 +81,7 @@ class Faults:
         pad: An arm too near the pad.
         arms: The arms' tools too near each other.
         bodies: Their outer bodies too near each other, or to the other arm's tool.
+        needle: The needle in tissue, once it has come out of it.
         place: The needle not between PSM_M's fingers.
         angle: The needle at a wrong angle there, or not there at all.
     """
@@ -90,6 +91,7 @@ class Faults:
     pad: Count | None = None
     arms: Count | None = None
     bodies: Count | None = None
+    needle: Count | None = None
     place: Count | None = None
     angle: Count | None = None
 

@@ -400,6 +400,7 @@ def timeline_of_plan(
     frame: str,
     played: Playback | None = None,
     odds: Mapping[int, float] | None = None,
+    event: str = "",
 ) -> Timeline:
     """Return a plan's motion in the base frame of PSM_A.
 
@@ -408,7 +409,8 @@ def timeline_of_plan(
         arm: Name of PSM_A.
         frame: Name of its base frame.
         played: The newest playback, of which the distances are shown; None if there is none.
-        odds: For each pass the probability that it succeeds.
+        odds: For each pass the probability of an event; None: none is shown.
+        event: That event in words.
     """
     t, at_s = trajectory, trajectory.stamps_s
     clock = _Clock.of(float(at_s[0]), float(at_s[-1]), t.rate_hz)
@@ -425,7 +427,7 @@ def timeline_of_plan(
         in_one_frame=True,
         clutch_s=(),
         stages=_stages(t),
-        traces=(*_distances(clock, t, played), *_odds(clock, t, odds or {})),
+        traces=(*_distances(clock, t, played), *_odds(clock, t, odds or {}, event)),
     )
 
 
@@ -458,7 +460,7 @@ def _distances(clock: _Clock, t: Trajectory, played: Playback | None) -> list[Tr
     return found
 
 
-def _odds(clock: _Clock, t: Trajectory, odds: Mapping[int, float]) -> list[Trace]:
+def _odds(clock: _Clock, t: Trajectory, odds: Mapping[int, float], event: str) -> list[Trace]:
     """Return the probability of each pass while it lasts."""
     if not odds:
         return []
@@ -467,4 +469,4 @@ def _odds(clock: _Clock, t: Trajectory, odds: Mapping[int, float]) -> list[Trace
     number = t.pass_index[begins]
     values = np.array([odds.get(one, np.nan) for one in range(t.passes)])[number]
     values[clock.at_s > ends[number] + 1e-6] = np.nan
-    return [Trace("The pass succeeds", "", None, _column(values))]
+    return [Trace(event, "", None, _column(values))]

@@ -339,7 +339,14 @@ def judge_plan(
     report = judge(playback, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
     tissue = None if plan.scene is None else plan.scene.tissue
     top = (None, UPWARDS) if tissue is None or beside is None else flat_tissue(trajectory, beside.report, tissue)
-    success = estimate_success(trajectory, approach_m=approach_m, pad_top_mm=top[0], pad_normal=top[1], errors=errors)
+    success = estimate_success(
+        trajectory,
+        approach_m=approach_m,
+        pad_top_mm=top[0],
+        pad_normal=top[1],
+        needle_mm=None if beside is None else beside.needle_mm,
+        errors=errors,
+    )
     return PlanVerdict(report, None if beside is None else beside.report, success)
 
 

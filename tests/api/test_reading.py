@@ -3,16 +3,23 @@
 import os
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
 
+from skills.errors import Busy
+from skills.library.recordings.recordings import check_digest
 from tests import backends
 from tests.api.service import CSV, KESTREL, MCAP, assert_problem, serving
 from tests.library import cases
-from tests.waiting import alive
+from tests.waiting import END_S, alive, until
 
 BAG = cases.bag()
+AT_ONCE = 50
+ALL = range(AT_ONCE)
 
 
 @pytest.mark.parametrize(
@@ -79,3 +86,64 @@ def test_a_service_that_stops_is_busy(own_fork_server, tmp_path):
         answer = service.http.post("/recordings", content=BAG, headers={"Content-Type": MCAP})
         assert_problem(answer, 503, "busy")
         assert answer.headers["retry-after"]
+
+
+@pytest.mark.parametrize("sent", [BAG, BAG[:-9]], ids=["sound", "damaged"])
+@pytest.mark.parametrize("path", ["/recordings", "/recordings/preview"])
+def test_equal_bytes_that_arrive_at_once_wait_for_one_reading(tmp_path, monkeypatch, path, sent):
+    arrived, read = [], []
+
+    def arrives(header: str | None, of_bytes: str) -> bool:
+        arrived.append(of_bytes)
+        return check_digest(header, of_bytes)
+
+    monkeypatch.setattr("skills.api.uploads.check_digest", arrives)
+    with serving(backends.fresh("sqlite", tmp_path)) as service, ThreadPoolExecutor(AT_ONCE) as clients:
+        server = service.app.state.reader.server
+
+        def call(*asked: Any, **how: Any) -> Any:
+            read.append(asked)
+            until(lambda: len(arrived) >= AT_ONCE)
+            return shared(*asked, **how)
+
+        shared = server.call
+        monkeypatch.setattr(server, "call", call)
+        asked = [clients.submit(service.http.post, path, content=sent, headers={"Content-Type": MCAP}) for _ in ALL]
+        answers = [one.result() for one in asked]
+        assert len(read) == 1
+        if sent == BAG:
+            assert sorted({one.status_code for one in answers}) == ([200] if "preview" in path else [200, 201])
+            assert len({one.json()["sha256"] for one in answers}) == 1
+        else:
+            assert {one.status_code for one in answers} == {422}
+            assert len({one.json()["detail"] for one in answers}) == 1
+        # Nothing is shared with later uploads: the answer is not kept.
+        service.http.post(path, content=sent, headers={"Content-Type": MCAP})
+        assert len(read) == 2
+
+
+def test_the_next_of_equal_uploads_reads_where_the_first_was_not_read(tmp_path, monkeypatch):
+    arrived, refused = Event(), []
+    with serving(backends.fresh("sqlite", tmp_path)) as service, ThreadPoolExecutor(2) as clients:
+        server = service.app.state.reader.server
+
+        def call(*asked: Any, **how: Any) -> Any:
+            if not refused:
+                refused.append(asked)
+                arrived.wait(END_S)
+                raise Busy("No process is available.")
+            return shared(*asked, **how)
+
+        def arrives(header: str | None, of_bytes: str) -> bool:
+            if refused:
+                arrived.set()
+            return check_digest(header, of_bytes)
+
+        shared = server.call
+        monkeypatch.setattr(server, "call", call)
+        monkeypatch.setattr("skills.api.uploads.check_digest", arrives)
+        first = clients.submit(service.http.post, "/recordings", content=BAG, headers={"Content-Type": MCAP})
+        until(lambda: refused)
+        second = clients.submit(service.http.post, "/recordings", content=BAG, headers={"Content-Type": MCAP})
+        assert_problem(first.result(), 503, "busy")
+        assert second.result().status_code == 201

@@ -157,7 +157,7 @@ def test_differences_and_progress_are_given_and_shown(scoring: Service, stored: 
     scored = scoring.client.score("kestrel", cases.SUTURE, demo=stored["plover"])
     assert scored["differences"]["named"][0]["kind"] == "time in motion"
     shown = page(scoring, f"/pages/demos/{stored['plover']}/score?surgeon=kestrel")
-    assert "What kestrel does differently" in shown
+    assert "What this motion does differently from kestrel" in shown
     assert all(words.split(";")[-1][:30] in shown for words in scored["differences"]["words"])
     path = f"/surgeons/plover/progress?suture={cases.SUTURE}&against=kestrel"
     found = scoring.http.get(path).json()

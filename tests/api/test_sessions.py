@@ -1,12 +1,13 @@
 """Sessions of pose styles: poses in, next poses out, and the reasons for which one is refused or closed."""
 
+import asyncio
 import json
 import sqlite3
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from threading import get_ident
-from time import sleep
+from time import monotonic, sleep
 from typing import Any
 
 import pytest
@@ -29,7 +30,7 @@ from skills.api.sessions import (
     UNWATCHED,
     WITHDRAWN,
 )
-from skills.errors import Busy
+from skills.errors import Busy, TooMany
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.keys import create_key, revoke_key
 from skills.library.policies.releases import release
@@ -38,7 +39,7 @@ from tests import backends
 from tests.api.posed import of_both_arms, of_pose_style
 from tests.api.service import KESTREL, POLICY, Service, serving
 from tests.library import cases
-from tests.waiting import END_S, until
+from tests.waiting import END_S, crowded, until
 
 SESSION = f"ws://localhost{POLICY}/session"
 
@@ -46,7 +47,8 @@ SESSION = f"ws://localhost{POLICY}/session"
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a busy machine take its time to read the database."""
-    monkeypatch.setattr(sessions, "UNKNOWN_S", END_S)
+    for name in ("UNKNOWN_S", "UNREAD_S", "STAYS_LATE_S", "MESSAGE_S"):
+        monkeypatch.setattr(sessions, name, 0.0 if name == "MESSAGE_S" else END_S)
 
 
 @pytest.fixture(params=backends.BACKENDS)
@@ -96,11 +98,13 @@ def test_a_session_follows_the_poses_as_next_does(posed: Service):
     with opened(posed) as socket:
         opening = socket.receive_json()
         assert (opening["version"], opening["frame"], opening["phases"]) == (1, "PSM2_base", 101)
-        assert opening["limits"] == {"rate_hz": 100.0, "burst": 50.0, "message_bytes": 4096, "idle_s": 30.0}
+        limits = {"rate_hz": 100.0, "burst": 50.0, "message_bytes": 4096, "idle_s": 30.0}
+        assert opening["limits"] == limits | {"late_ms": 10.0, "stays_late_s": END_S}
         for _ in range(20):
             socket.send_json(hand)
             answer = socket.receive_json()
             asked = posed.http.post(f"{POLICY}/next", json=hand | {"phase": phase}).json()
+            assert answer.pop("late_ms") is None or crowded() > 1
             assert answer == {name: asked[name] for name in answer if name in asked} | {"newer_version": None}
             hand, phase = {name: answer[name] for name in hand}, answer["phase"]
     assert phase == 20
@@ -190,10 +194,90 @@ def test_sessions_close_where_a_withdrawal_would_not_be_seen(posed: Service, mon
     def unread(*_: object) -> None:
         raise Busy("The database is busy.")
 
-    monkeypatch.setattr(sessions, "UNKNOWN_S", 0.3)
+    monkeypatch.setattr(sessions, "UNREAD_S", 0.3)
     monkeypatch.setattr(sessions, "_look", unread)
     with opened(posed) as socket:
         assert closed(socket) == (BUSY, UNREADABLE)
+
+
+def test_no_pose_is_given_while_the_database_is_unread(posed: Service, monkeypatch: pytest.MonkeyPatch):
+    hand, look, unread = start_of(posed), sessions._look, [Busy("The database is busy.")]
+
+    def fails(*given: Any) -> Any:
+        if unread:
+            raise unread[0]
+        return look(*given)
+
+    with opened(posed) as socket:
+        socket.receive_json()
+        monkeypatch.setattr(sessions, "_look", fails)
+        monkeypatch.setattr(posed.app.state.sessions._changes, "version", lambda: None)
+        monkeypatch.setattr(sessions, "UNKNOWN_S", 0.3)
+
+        def asked() -> dict[str, Any]:
+            socket.send_json(hand)
+            answer: dict[str, Any] = socket.receive_json()
+            return answer
+
+        until(lambda: asked() == {"error": sessions.UNREAD})
+        unread.clear()
+        until(lambda: "error" not in asked())
+
+
+def test_a_late_answer_says_so_and_the_youngest_sessions_are_closed(posed: Service, monkeypatch: pytest.MonkeyPatch):
+    hand = start_of(posed)
+    with opened(posed) as first, opened(posed) as second:
+        for socket in (first, second):
+            socket.receive_json()
+        monkeypatch.setattr(sessions, "LATE_S", -1.0)
+        monkeypatch.setattr(sessions, "STAYS_LATE_S", 0.3)
+        for socket in (first, second):
+            socket.send_json(hand)
+            assert socket.receive_json()["late_ms"] >= 0.0
+        assert closed(second) == (BUSY, sessions.LATE)
+        monkeypatch.setattr(sessions, "LATE_S", END_S)
+        first.send_json(hand)
+        assert first.receive_json()["late_ms"] is None
+
+
+def test_a_session_for_which_the_processor_has_no_time_is_refused(posed: Service, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(posed.app.state.sessions._capacity, "_message_s", sessions.SHARE / sessions.RATE_HZ)
+    with opened(posed) as socket:
+        socket.receive_json()
+        with pytest.raises(WebSocketDenialResponse) as refused, opened(posed):
+            pass
+        denied(refused.value, 429)
+        assert float(refused.value.headers["retry-after"]) == sessions.AGAIN_S
+        assert "no time for another session" in refused.value.json()["detail"]
+
+
+def test_the_capacity_is_measured_and_admitted_sessions_count_at_once(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sessions, "WINDOW_S", 0.05)
+
+    async def admitted() -> list[int]:
+        capacity, found = sessions.Capacity(), []
+        measuring = asyncio.create_task(capacity.measure())
+        for message_s in (0.001, 0.0001):
+            capacity._message_s, number = message_s, 0
+            with suppress(TooMany):
+                while True:
+                    capacity.admit()
+                    number += 1
+            found.append(number)
+            before_s = capacity._message_s
+            began_s = monotonic()
+            while monotonic() - began_s < 0.5:
+                capacity.messages += 1000
+                await asyncio.sleep(0.001)
+            assert capacity._message_s < before_s / 2, "a thousand messages in a millisecond take less"
+            assert capacity._load > 0
+            assert sum(capacity._admitted) == 0
+        measuring.cancel()
+        return found
+
+    few, many = asyncio.run(admitted())
+    assert few == round(sessions.SHARE / 0.1)
+    assert few < many <= round(sessions.SHARE / 0.01), "less the load of the first ones"
 
 
 def test_a_new_release_is_told_and_changes_nothing(posed: Service):

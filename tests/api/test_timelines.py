@@ -44,7 +44,7 @@ def test_a_plan_is_its_trajectory_with_the_verdict_beside_it(told: Service):
     assert np.abs(timeline.arms[0].tip_mm[0] - rows[0, 3:6]).max() < 1e-4
     assert np.abs(timeline.arms[0].joints[-1] - rows[-1, 10:16]).max() < 0.1
     names = [trace.name for trace in timeline.traces]
-    assert names == ["Tools above the pad", "The pass succeeds"]
+    assert names == ["Tools above the pad", "The pass stays within reach and clear, the errors of an uncalibrated arm"]
     assert (timeline.traces[1].values[:5] <= 1).all()
 
 

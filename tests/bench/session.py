@@ -1,4 +1,8 @@
-"""Sessions of a pose style: 50 clients at 100 Hz over loopback against a real server, and their end at a withdrawal.
+"""Sessions of a pose style: 100 clients at 100 Hz over loopback against a real server, which admits what it can carry.
+
+Those that it refuses must be told when to come again, those that it admits must be answered in time until their end at
+a withdrawal. Then one session floods the server with pings, and the effect on another client is compared with that of
+the same bytes over HTTP.
 
 The clients are one process of their own, which writes frames by hand, so that it takes less than the server. The time
 of a message counts from the moment at which it was due.
@@ -7,14 +11,20 @@ of a message counts from the moment at which it was due.
 import asyncio
 import json
 import os
+import socket
 import subprocess
 import sys
 import tempfile
 from base64 import b64encode
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from threading import Event, Thread
 from time import monotonic, perf_counter, sleep
 from typing import Any
 
+import httpx2 as httpx
 import numpy as np
 from rich.table import Table
 
@@ -22,7 +32,7 @@ from skills.db.session import Database
 from skills.learning.pose_step import next_pose
 from skills.library.policies import releases
 from skills.library.policies.pose_styles import poses_of
-from skills.library.policies.versions import served_release
+from skills.library.policies.versions import find_version, served_release
 from skills.serving import environment
 from skills.settings import Settings
 from tests import backends
@@ -32,10 +42,12 @@ from tests.bench.hail import ROOT
 from tests.bench.serving import processor_s
 from tests.library.test_pose_styles import turning
 
-CLIENTS, RATE_HZ, SECONDS = 50, 100.0, 10.0
+CLIENTS, RATE_HZ, SECONDS = 100, 100.0, 10.0
+FLOOD_S, PIECE = 8.0, 4096
 CALLS = 5000
 START = {"position_mm": [-10.0, 55.0, -135.0], "rotation_xyzw": [0.5**0.5, 0.5**0.5, 0.0, 0.0], "phase": 0}
-TEXT, CLOSE, MASKED = 0x81, 0x88, 0x80
+TEXT, CLOSE, PING, MASKED = 0x81, 0x88, 0x89, 0x80
+UPLOAD = b"POST /recordings HTTP/1.1\r\nHost: localhost\r\nContent-Type: text/csv\r\nContent-Length: 250000000\r\n\r\n"
 
 
 def session(table: Table, clients: int = CLIENTS, seconds: float = SECONDS) -> None:
@@ -79,11 +91,12 @@ def over_loopback(table: Table, database: Database, clients: int, seconds: float
         command = [sys.executable, "-m", "tests.bench.session", str(settings.port), str(clients), str(seconds)]
         crowd = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         assert crowd.stdout is not None
-        assert crowd.stdout.readline() == "open\n"
+        admitted, again_s = json.loads(crowd.stdout.readline())
+        table.add_row("  admitted", f"{admitted} of {clients}", f"the others may come again in {again_s}")
         before_s = processor_s(server.pid)
         measured = json.loads(crowd.stdout.readline())
         work = (processor_s(server.pid) - before_s) / len(measured["took"])
-        name = f"  {clients} clients at {RATE_HZ:g} Hz, {len(measured['took'])} answers"
+        name = f"  {admitted} clients at {RATE_HZ:g} Hz, {len(measured['took'])} answers"
         table.add_row(name, *percentiles(measured["took"]))
         table.add_row(
             "    server", f"{1e6 * work:.0f} us", f"of the processor a message, load {os.getloadavg()[0]:.1f}"
@@ -95,17 +108,65 @@ def over_loopback(table: Table, database: Database, clients: int, seconds: float
         withdrawn = monotonic()
         ends = json.loads(crowd.stdout.readline())
         late = [at - withdrawn for at, _ in ends]
-        assert {code for _, code in ends} == {4404} and len(ends) == clients, ends
+        assert {code for _, code in ends} == {4404} and len(ends) == admitted, ends
         table.add_row("    closed after a withdrawal", f"{max(late):.2f} s", f"the last; the first {min(late):.2f} s")
         crowd.wait()
+        with database.writing() as opened:
+            releases.release(opened, find_version(opened, **KESTREL, version=policy.version), "bench")
+        flooded(table, settings.port)
     finally:
         server.terminate()
         server.wait()
 
 
+def flooded(table: Table, port: int) -> None:
+    """Measure another client's answers beside a flood of pings, and beside the same bytes over HTTP."""
+    alone = beside(port, lambda over: over.wait(FLOOD_S))
+    pings = beside(port, partial(flood, port, ping=True))
+    bodies = beside(port, partial(flood, port, ping=False))
+    for name, took in (("alone", alone), ("beside pings", pings), ("beside the same bytes over HTTP", bodies)):
+        table.add_row(f"  another client {name}, {len(took)} answers", *percentiles(took))
+
+
+def beside(port: int, do: Callable[[Event], object]) -> list[float]:
+    """Return the seconds that the answers to another client took during `FLOOD_S` of something."""
+    over, took = Event(), list[float]()
+    thread = Thread(target=do, args=(over,))
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=FLOOD_S) as http:
+        thread.start()
+        until_s = monotonic() + FLOOD_S
+        while (began_s := monotonic()) < until_s:
+            http.get(POLICY).raise_for_status()
+            took.append(monotonic() - began_s)
+            sleep(0.01)
+    over.set()
+    thread.join()
+    return took
+
+
+def flood(port: int, over: Event, *, ping: bool) -> None:
+    """Send pieces of pings, or of the body of an upload, as fast as they are taken; connect again when it is closed."""
+    pings = bytes([PING, MASKED, 0, 0, 0, 0]) * (PIECE // 6)
+    head = b"\r\n".join(upgrade(f"127.0.0.1:{port}")) if ping else UPLOAD
+    while not over.is_set():
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0) as connection:
+            connection.sendall(head)
+            if ping:
+                connection.recv(PIECE)
+            while not over.is_set():
+                connection.sendall(pings)
+
+
 def percentiles(took: list[float]) -> tuple[str, str]:
     middle, p99, most = (1000 * float(np.quantile(took, part)) for part in (0.5, 0.99, 1.0))
     return f"p99 {p99:.2f} ms", f"median {middle:.3f} ms, at most {most:.1f} ms"
+
+
+def upgrade(host: str) -> list[bytes]:
+    """Return the lines of the request for a session."""
+    key = b64encode(os.urandom(16))
+    head = [f"GET {POLICY}/session HTTP/1.1".encode(), b"Host: " + host.encode(), b"Upgrade: websocket"]
+    return [*head, b"Connection: Upgrade", b"Sec-WebSocket-Key: " + key, b"Sec-WebSocket-Version: 13", b"", b""]
 
 
 # ---- the clients ---------------------------------------------------------------------------------------------------
@@ -117,16 +178,13 @@ class Hand(asyncio.Protocol):
     def __init__(self, host: str, first_s: float, took: list[float]) -> None:
         self.host, self.due, self.took = host, first_s, took
         self.loop = asyncio.get_running_loop()
-        self.opened: asyncio.Future[None] = self.loop.create_future()
+        self.opened: asyncio.Future[str | None] = self.loop.create_future()
         self.ended: asyncio.Future[tuple[float, int]] = self.loop.create_future()
         self.buffer, self.pose, self.until = b"", b"", 0.0
 
     def connection_made(self, transport: Any) -> None:
         self.transport = transport
-        key = b64encode(os.urandom(16)).decode()
-        head = (f"GET {POLICY}/session HTTP/1.1", f"Host: {self.host}", "Upgrade: websocket", "Connection: Upgrade")
-        rest = (f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13", "", "")
-        transport.write("\r\n".join(head + rest).encode())
+        transport.write(b"\r\n".join(upgrade(self.host)))
 
     def data_received(self, data: bytes) -> None:
         self.buffer += data
@@ -134,8 +192,13 @@ class Hand(asyncio.Protocol):
             head, end, rest = self.buffer.partition(b"\r\n\r\n")
             if not end:
                 return
-            assert b" 101 " in head.split(b"\r\n")[0], head
+            status, *headers = head.decode().lower().split("\r\n")
             self.buffer = rest
+            if " 101 " not in status:
+                assert " 429 " in status, head
+                self.opened.set_result(next(one for one in headers if one.startswith("retry-after:")))
+                self.transport.close()
+                return
             self.opened.set_result(None)
         while (frame := self.frame()) is not None:
             kind, payload = frame
@@ -177,15 +240,17 @@ class Hand(asyncio.Protocol):
 async def crowd(port: int, clients: int, seconds: float) -> None:
     """Open sessions, follow the poses for some time, then wait until all are closed."""
     loop, took = asyncio.get_running_loop(), list[float]()
-    hands = []
+    hands, refused = [], []
     for _ in range(clients):
         _, hand = await loop.create_connection(lambda: Hand(f"127.0.0.1:{port}", 0.0, took), "127.0.0.1", port)
-        await hand.opened
-        hands.append(hand)
-    print("open", flush=True)
+        if (again := await hand.opened) is None:
+            hands.append(hand)
+        else:
+            refused.append(again)
+    print(json.dumps([len(hands), sorted({*refused})]), flush=True)
     begin = loop.time() + 0.1
     for number, hand in enumerate(hands):
-        hand.pose, hand.due = json.dumps(START).encode(), begin + number / clients / RATE_HZ
+        hand.pose, hand.due = json.dumps(START).encode(), begin + number / len(hands) / RATE_HZ
         hand.until = begin + seconds
         loop.call_at(hand.due, hand.send)
     await asyncio.sleep(seconds + 1.0)

@@ -35,7 +35,7 @@ from tests.waiting import END_S, until
 ONCE = Retrying(attempts=1)
 START = ([-10.0, 55.0, -135.0], [0.5**0.5, 0.5**0.5, 0.0, 0.0])
 TUBE = TubeCertificate(TubeLimits(), 1.0, 0.1, 1.0, 0.1, ticks=9, checked=1, faults=())
-LIMITS = SessionLimits(rate_hz=100.0, burst=50.0, message_bytes=4096, idle_s=30.0)
+LIMITS = SessionLimits(rate_hz=100.0, burst=50.0, message_bytes=4096, idle_s=30.0, late_ms=10.0, stays_late_s=2.0)
 OPENING = SessionOpening(
     version=1, sha256="0" * 64, arm="PSM2", frame="PSM2_base", phases=101, tick_s=0.05, tube=TUBE, limits=LIMITS
 )

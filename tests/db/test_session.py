@@ -1,6 +1,8 @@
 """Transactions on both back ends: atomic, and serialised if two write; and the disk under the database."""
 
+import errno
 import logging
+import os
 import sqlite3
 import stat
 import subprocess
@@ -8,8 +10,9 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,7 +23,7 @@ from skills import serving
 from skills.api.app import create_app
 from skills.db import engines
 from skills.db import session as sessions
-from skills.db.disk import EXIT_CODE, make_private
+from skills.db.disk import EXIT_CODE, RESERVE_BYTES, RESERVE_STEP_BYTES, Reserve, make_private
 from skills.db.models import SutureType
 from skills.db.service_tables import Executor
 from skills.db.session import Database
@@ -375,3 +378,59 @@ def test_opening_a_file_once_more_gives_up_no_lock_on_it(tmp_path: Path, another
         with one.writing() as session:
             session.add(Executor(id="second"))
         assert count_elsewhere() == "2"
+
+
+def test_a_file_without_write_permission_is_said_so_in_words(tmp_path: Path):
+    url = backends.fresh("sqlite", tmp_path)
+    with closing(Database(url)) as database:
+        event.listen(database.engine, "connect", lambda connection, _: connection.execute("PRAGMA query_only = ON"))
+        for change in (database.writing, lambda: database.writing(())):
+            with pytest.raises(DatabaseUnusable, match="cannot be written to"), change():
+                pass
+        with pytest.raises(DatabaseUnusable, match="cannot be written to"):
+            database.migrate()
+        with database.reading() as session:
+            assert session.get(Executor, "first") is None
+
+
+def test_the_reserve_is_free_during_a_transaction_that_ends_something(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    url = backends.fresh("sqlite", tmp_path)
+    reserve = Path(f"{url.removeprefix('sqlite:///')}.reserve")
+    full = SimpleNamespace(f_bavail=0, f_frsize=4096)
+    with closing(Database(url)) as database, closing(Database(url)) as other:
+        database.migrate()
+        assert (reserve.stat().st_size, mode(reserve)) == (RESERVE_BYTES, 0o600)
+        assert reserve.stat().st_blocks * 512 >= RESERVE_BYTES, "it is allocated, not sparse"
+        with database.ending():
+            assert reserve.stat().st_size == RESERVE_BYTES, "the disk has space"
+        monkeypatch.setattr(os, "fstatvfs", lambda _: full)
+        with database.writing():
+            assert reserve.stat().st_size == RESERVE_BYTES, "it is not for everybody"
+        for fails in (False, True):
+            with suppress(ZeroDivisionError), database.ending() as session:
+                assert reserve.stat().st_size == 0
+                other.reserve_space()
+                assert reserve.stat().st_size == 0, "another process leaves it to this one"
+                session.add(SutureType(slug=f"new-{fails}", name="0", also_called=[], family="-", description=""))
+                assert 1 / (not fails)
+            assert reserve.stat().st_size == RESERVE_BYTES
+        database.forget()
+        assert reserve.stat().st_size == RESERVE_BYTES
+
+
+def test_a_disk_gives_the_reserve_as_far_as_it_has_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    allocate, left = os.posix_fallocate, [5, 100]
+
+    def some(handle: int, at: int, size: int) -> None:
+        if not left[0]:
+            raise OSError(errno.ENOSPC, "full")
+        left[0] -= 1
+        allocate(handle, at, size)
+
+    monkeypatch.setattr(os, "posix_fallocate", some)
+    reserve = Reserve(tmp_path / "skills.sqlite")
+    reserve.allocate()
+    assert (tmp_path / "skills.sqlite.reserve").stat().st_size == 5 * RESERVE_STEP_BYTES
+    left.pop(0)
+    reserve.allocate()
+    assert (tmp_path / "skills.sqlite.reserve").stat().st_size == RESERVE_BYTES

@@ -40,7 +40,7 @@ def installation(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPa
     url = backends.fresh(request.param, folder)
     with closing(Database(url)) as database:
         cases.add_surgeon(database)
-        large = cases.table(cases.points_mm(samples=SAMPLES), rate_hz=5000.0)
+        large = cases.table(cases.points_mm(samples=SAMPLES), rate_hz=20_000.0)
         demo = cases.add_demo(database, large)
         spool = folder / "spool"
         spool.mkdir()

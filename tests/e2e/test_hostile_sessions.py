@@ -6,6 +6,7 @@ import struct
 import subprocess
 from base64 import b64encode
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import httpx2 as httpx
@@ -13,6 +14,7 @@ import pytest
 from websockets.sync.client import connect
 
 from skills.client import Client
+from skills.serving import FRAMES, SLICE_BYTES
 from tests.api.posed import of_pose_style
 from tests.api.service import KESTREL, POLICY
 from tests.e2e.conftest import Service
@@ -96,6 +98,31 @@ def flood(connection: socket.socket) -> None:
         return
 
 
+def pings(connection: socket.socket) -> None:
+    connection.sendall(bytes([0x89, 0x80, 0, 0, 0, 0]) * 5000)
+
+
+def pieces(connection: socket.socket) -> None:
+    """Send a message in empty pieces that never ends."""
+    connection.sendall(bytes([0x01, 0x80, 0, 0, 0, 0]) + bytes([0x00, 0x80, 0, 0, 0, 0]) * 5000)
+
+
+@pytest.mark.parametrize("send", [pings, pieces])
+def test_frames_that_never_reach_a_session_are_limited_too(running: Service, send: Callable[[socket.socket], None]):
+    until(lambda: gauge(running) == 0)
+    connection = opened(running)
+    with suppress(OSError):
+        send(connection)
+    read = b""
+    with suppress(ConnectionResetError):
+        while piece := connection.recv(4096):
+            read += piece
+    connection.close()
+    assert read.count(b"\x8a\x00") <= FRAMES + SLICE_BYTES // 6, "few pings are answered"
+    assert b"At most 5 frames without a message a second" in read
+    until(lambda: gauge(running) == 0)
+
+
 def too_long(connection: socket.socket) -> None:
     connection.sendall(bytes([0x81, 0x80 | 126]) + (5000).to_bytes(2, "big") + bytes(4) + bytes(5000))
 
@@ -105,7 +132,7 @@ def unmasked(connection: socket.socket) -> None:
 
 
 @pytest.mark.nightly  # by day tests/api/test_sessions.py closes sessions for the same reasons, without a server
-@pytest.mark.parametrize("leave", [reset, half_a_frame, stalled, flood, too_long, unmasked])
+@pytest.mark.parametrize("leave", [reset, half_a_frame, stalled, flood, pings, pieces, too_long, unmasked])
 def test_sessions_that_go_wrong_leave_nothing_behind(running: Service, leave: Callable[[socket.socket], None]):
     assert running.process is not None
     until(lambda: gauge(running) == 0)

@@ -10,6 +10,8 @@ import resource
 import shutil
 import signal
 import subprocess
+import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +19,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import BinaryIO
 
 import httpx2 as httpx
 from sqlalchemy import func, select
@@ -30,12 +33,13 @@ from tests.faults.crew import STYLES, UPLOADER, Crew
 from tests.faults.installation import Installation
 from tests.faults.ledger import Ledger
 from tests.faults.shim import Shim, compiler
+from tests.library import cases
 from tests.needs import NEEDS
 from tests.waiting import END_S, alive, children, until
 
 HOUR_NS = 3600 * 10**9
 AHEAD_NS = 400 * 24 * HOUR_NS  # longer than every retention
-SMALL_BYTES = 192 << 20  # of the file system that fills up
+SMALL_BYTES = 448 << 20  # of the file system that fills up
 HOLD_S = 6.0  # how long a fault lasts, unless it is an instant
 SLOW_US = 300_000  # of each sync on a slow disk, and a hundredth of it of each write
 
@@ -126,14 +130,74 @@ def _mounts() -> bool:
 
 def full_disk(site: Site) -> None:
     """Fill the file system to its last byte, and again whenever something was freed."""
-    filler, deadline = site.folder / "filler", time.monotonic() + HOLD_S
-    with filler.open("wb", buffering=0) as file:
+    deadline = time.monotonic() + HOLD_S
+    with _full(site.folder) as file:
         while time.monotonic() < deadline:
-            with suppress(OSError):
-                while True:
-                    file.write(bytes(4096))
+            _fill(file)
             time.sleep(0.05)
+
+
+def ending_on(*, database: bool) -> Callable[[Site], None]:
+    """Return the fault of a full disk on which a service of its own withdraws, revokes and erases.
+
+    Args:
+        database: Whether its database is on the disk; otherwise only its temporary files are.
+    """
+
+    def inflict(site: Site) -> None:
+        with ExitStack() as stack:
+            folder = Path(tempfile.mkdtemp(dir=site.folder if database else site.folder.parent))
+            service = Installation(folder)
+            service.environment["TMPDIR"] = str(site.folder)
+            stack.callback(_stop, service)
+            service.start()
+            http = stack.enter_context(httpx.Client(base_url=service.url, timeout=END_S))
+            for name, shift_mm in (("wren", 0.1), ("heron", 0.2), ("osprey", 0.3)):
+                http.put(f"/surgeons/{name}", json={}).raise_for_status()
+                how = {"content": cases.hand_off((shift_mm, 0.0, 0.0)), "headers": {"Content-Type": "text/csv"}}
+                asked = {"surgeon": name, "suture": cases.SUTURE}
+                http.post("/demos", params=asked, **how).raise_for_status()
+                http.post("/trainings", json=asked | {"release": True}).raise_for_status()
+                until(lambda at=f"/policies/{name}/{cases.SUTURE}": http.get(at).is_success)
+            http.headers["X-API-Key"] = http.post("/keys", json={"owner": "a", "role": "admin"}).json()["secret"]
+            lost = http.post("/keys", json={"owner": "b", "role": "admin"}).json()
+            stack.enter_context(_full(site.folder))
+            demo = {"content": cases.hand_off((0.4, 0.0, 0.0)), "headers": {"Content-Type": "text/csv"}}
+            if database:
+                full = http.post("/demos", params={"surgeon": "wren", "suture": cases.SUTURE}, **demo)
+                assert full.status_code == 507, full.text
+            for method, path, body, at in (
+                ("DELETE", f"/policies/wren/{cases.SUTURE}/release", None, f"/policies/wren/{cases.SUTURE}"),
+                ("PUT", "/surgeons/heron", {"consent": {"uses": ["atlas"]}}, f"/policies/heron/{cases.SUTURE}"),
+                ("DELETE", f"/keys/{lost['key']}", None, None),
+                ("DELETE", "/surgeons/osprey", None, "/surgeons/osprey"),
+            ):
+                answer = http.request(method, path, json=body)
+                assert answer.is_success, (method, path, answer.text)
+                assert at is None or http.get(at).status_code in (404, 410), at
+            assert http.get("/surgeons", headers={"X-API-Key": lost["secret"]}).status_code == 401
+            verified = subprocess.run(
+                [sys.executable, "-m", "skills", "verify"], env=service.environment, capture_output=True, text=True
+            )
+            assert verified.returncode == 0, verified.stderr
+
+    return inflict
+
+
+@contextmanager
+def _full(folder: Path) -> Iterator[BinaryIO]:
+    """Fill a file system to its last byte for the duration of the block; yield the file that fills it."""
+    filler = folder / "filler"
+    with filler.open("wb", buffering=0) as file:
+        _fill(file)
+        yield file
     filler.unlink()
+
+
+def _fill(file: BinaryIO) -> None:
+    with suppress(OSError):
+        while True:
+            file.write(bytes(4096))
 
 
 def failing(**numbers: int) -> Callable[[Site], None]:
@@ -246,6 +310,10 @@ def two_servers(site: Site) -> None:
 
 FAULTS = (
     Fault("full-disk", "full disk (a tmpfs that is filled)", full_disk, mounted=True),
+    Fault("full-disk-ending", "full disk, on which others withdraw, revoke and erase", ending_on(database=True),
+          mounted=True),
+    Fault("full-temporary-ending", "full disk of temporary files, while others withdraw, revoke and erase",
+          ending_on(database=False), mounted=True),
     Fault("no-space", "writes fail: no space (ENOSPC)", failing(write_error=errno.ENOSPC), shimmed=True),
     Fault("write-fails", "writes fail (EIO)", failing(write_error=errno.EIO), shimmed=True),
     Fault("sync-fails", "fsync fails (EIO)", failing(sync_error=errno.EIO), shimmed=True),

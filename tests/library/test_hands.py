@@ -6,17 +6,25 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from sqlalchemy import select
 
+from skills.db.models import Release
 from skills.db.session import Database
 from skills.demonstration.recording import Motion, Recording
 from skills.errors import BadPlan, Conflict
 from skills.formats import write_mcap
+from skills.jobs.workflows import Work
 from skills.kinematics import POINTING_DOWN, angle_between, matrix_of, quaternion_of
 from skills.library.operation.integrity import planned
+from skills.library.perform import perform_job
 from skills.library.plans.plans import find_plan, trajectory_of
 from skills.library.policies import releases
+from skills.library.policies.gate import GateLimits
+from skills.library.policies.training import request_training
 from skills.planning.handoff import turn
 from skills.planning.plan import driven_pass
+from skills.schemas.training import TrainingIn
+from skills.settings import Settings
 from tests.library import cases
 from tests.library.test_replay import gate, judged
 
@@ -83,10 +91,21 @@ def test_a_version_checked_with_the_jaw_held_is_not_released(database: Database,
         lambda *given: replace(driven_pass(*given), orientation="demonstrated"),
     )
     version = cases.train(database)
-    monkeypatch.undo()
     with pytest.raises(Conflict, match=r"turns by 60\.0 degrees, over 10.*train it again"):
         cases.release(database, version)
-    cases.release(database, version, constant_turn_deg=61.0)
+    assert [training_released(database, limit_deg) for limit_deg in (10.0, 61.0)] == [False, True]
+
+
+def training_released(database: Database, constant_turn_deg: float) -> bool:
+    """Ask for the release of the version by a training, in an installation that states this limit."""
+    settings = Settings(database_url=database.url, constant_turn_deg=constant_turn_deg)
+    with database.writing() as session:
+        asked = TrainingIn(surgeon="kestrel", suture=cases.SUTURE, release=True)
+        job = request_training(session, asked, "test", GateLimits.of(settings)).job
+    if job.state == "queued":
+        assert Work(database, settings, perform_job).try_once(job.row, job.attempt, 0)
+    with database.reading() as session:
+        return session.scalar(select(Release)) is not None
 
 
 def test_a2_ends_where_both_arms_were_recorded(database: Database):

@@ -280,6 +280,11 @@ def test_a_head_kept_elsewhere_finds_an_older_state_put_back(tmp_path: Path):
     assert "the history was cut" in why
 
 
+def test_a_missing_folder_of_the_saved_heads_is_refused_with_its_path(tmp_path: Path):
+    with pytest.raises(BadSettings, match=f"The folder {tmp_path / 'gone'} of SKILLS_CHECKPOINTS does not exist"):
+        Database(backends.fresh("sqlite", tmp_path), checkpoints=tmp_path / "gone" / "heads")
+
+
 def test_a_row_written_past_the_service_is_not_logged_for_its_author(database: Database):
     sign_history(database)
     with database.engine.connect() as connection:  # with triggers, without the service's `writing`

@@ -1,6 +1,7 @@
 """The cache of parsed recordings: never another value than that of the bytes, and never a reason to fail."""
 
 import io
+import sqlite3
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -32,6 +33,7 @@ from skills.schemas.demos import DemoIn
 from skills.schemas.recordings import TableIn
 from skills.schemas.scores import ScoreIn
 from skills.seeds.recordings import sample_recordings
+from tests import backends
 from tests.by_day import some
 from tests.formats import bags, lerobots, trials
 from tests.formats.test_confined import same
@@ -169,6 +171,36 @@ def test_a_changed_entry_is_never_used_and_is_replaced(database: Database, damag
     assert wrong(database) == []
 
 
+@pytest.mark.parametrize("damage", ["an empty chunk", "another version"])
+def test_a_damaged_entry_of_several_transactions_is_replaced(
+    database: Database, monkeypatch: pytest.MonkeyPatch, damage: str
+):
+    monkeypatch.setattr(content_cache, "CHUNK_BYTES", 1000)
+    monkeypatch.setattr(content_cache, "AT_ONCE_BYTES", 4000)
+    sha256, decoded = add(database, sample_recordings()[0].data), []
+    assert stored_recording(database, sha256, never)
+    with database.writing() as session:
+        DAMAGES[damage](session)
+    told = stored_recording(database, sha256, counting(decoded))
+    assert len(decoded) == 1 and same(told, stored_recording(database, sha256, never))
+    assert wrong(database) == []
+
+
+def test_chunks_without_an_entry_are_replaced(tmp_path: Path):
+    """The sqlite3 program does not enforce references, so that a deletion there leaves them."""
+    with backends.opened(backends.fresh("sqlite", tmp_path)) as database:
+        cases.add_surgeon(database)
+        sha256, decoded = add(database), []
+        with sqlite3.connect(database.url.removeprefix("sqlite:///")) as program:
+            program.execute("DELETE FROM parsed_recordings")
+            program.execute("UPDATE parsed_chunks SET data = x'00'")
+        program.close()
+        assert counted(database) == (0, 1)
+        assert add_demo(database, sha256, CUT, "test", counting(decoded)).new
+        assert len(decoded) == 1 and same(decoded[0], stored_recording(database, sha256, never))
+        assert wrong(database) == []
+
+
 def test_a_damaged_entry_is_logged_and_found_by_verify(database: Database, caplog: pytest.LogCaptureFixture):
     sha256 = add(database)
     cases.committed(database, damage_chunk)
@@ -236,7 +268,8 @@ def test_verify_compares_the_newest_content_or_all_with_the_bytes(database: Data
     assert wrong(database, decode_all=True) == [
         (
             "recordings 1",
-            "its cached content differs from its bytes; delete its row of parsed_recordings, which is written again",
+            "its cached content differs from its bytes; delete its rows of parsed_chunks and parsed_recordings, which "
+            "are written again",
         )
     ]
     replace_entry(database, second, false)

@@ -140,7 +140,7 @@ def test_without_a_hand_off_no_error_is_said_to_cost_success():
     cost = Cost("tip_bias_mm", probability(20, 20))
     found = doubted(probability(15, 20), of_pass(faults=Faults(reach=0, limits=0, pad=0)), errors=CALIBRATED, cost=cost)
     most = line_of(about(1), found).costs_most
-    assert most is not None and most.endswith("without it 100.0 % of the worlds stay clear.")
+    assert most is not None and most.endswith("without it 100.0 % of the worlds stay within reach and clear.")
 
 
 @pytest.mark.parametrize(

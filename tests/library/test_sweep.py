@@ -20,13 +20,15 @@ from skills.library.operation.sweep import STEADY_S, SteadyClock, drop_contents,
 from skills.library.people.erasure import delete_recording, erase_surgeon
 from skills.library.plans.plans import planned, trajectory_of
 from skills.library.policies import retraining
+from skills.library.policies.retraining import request_retraining
 from skills.library.recordings import content_cache, recordings
 from skills.library.recordings.recordings import find_recording, recording_bytes, store_recording, stored_recording
+from skills.schemas.training import RetrainingIn
 from skills.settings import Settings
 from skills.verification.playback import Pictures
 from tests.db.test_query_plans import noted
 from tests.library import cases
-from tests.library.styles import ask_retraining, counted, finish, look, parts_of
+from tests.library.styles import add_styles, ask_retraining, counted, finish, look, parts_of, styles_of
 from tests.library.test_pictures import store_playback
 from tests.planning.motions import ideal_playback
 
@@ -305,6 +307,36 @@ def test_a_batch_whose_request_was_interrupted_fails_and_can_be_repeated(
     assert [part.state for part in parts_of(database, job)] == ["cancelled"]
     again = ask_retraining(database)
     assert again.row != job.row
+
+
+@pytest.mark.parametrize("killed", [2, 3, 4])  # before each of two styles, and before it is complete
+def test_an_equal_request_goes_on_with_a_batch_that_was_interrupted(
+    database: Database, monkeypatch: pytest.MonkeyPatch, killed: int
+):
+    monkeypatch.setattr(retraining, "STYLES_AT_ONCE", 1)
+    add_styles(database, 2)
+    with monkeypatch.context() as patched, failing_at(patched, killed), pytest.raises(KeyboardInterrupt):
+        ask_retraining(database)
+    again = request_retraining(database, RetrainingIn(), "test")
+    assert len({one.demonstration_row for one in styles_of(database, again.job)}) == 2
+    assert counted(database, StyleToRetrain) == 2 and again.new and finish(database, again.job).state == "succeeded"
+    with database.reading() as session:
+        assert session.scalar(select(func.count()).where(Job.kind == "retraining")) == 1
+    assert not request_retraining(database, RetrainingIn(), "test").new
+
+
+def test_two_equal_requests_that_add_styles_at_once_add_each_once(database: Database, monkeypatch: pytest.MonkeyPatch):
+    others: list[bool] = []
+
+    def ask_too(session: Session, job: Job) -> None:
+        session.commit()
+        if not others:
+            others.append(True)
+            assert request_retraining(database, RetrainingIn(), "test").job.row == job.row
+
+    job = batch_of_two(database, monkeypatch, ask_too)
+    assert counted(database, StyleToRetrain) == 2
+    assert finish(database, job).state == "succeeded"
 
 
 def test_a_batch_cancelled_while_styles_are_added_gets_no_more(database: Database, monkeypatch: pytest.MonkeyPatch):

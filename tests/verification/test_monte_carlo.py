@@ -19,10 +19,17 @@ from skills.planning.passes import PassPath
 from skills.planning.trajectory import Trajectory, time_parametrise
 from skills.verification import monte_carlo, probabilities
 from skills.verification.arm_errors import CALIBRATED, MEAN_LENGTH, SIZES, UNCALIBRATED, ArmErrors
-from skills.verification.clearance import FINGER_RADIUS_MM, NEEDLE_THICK_MM, WRIST_RADIUS_MM, clearance_to_pad, links_of
+from skills.verification.clearance import (
+    ARC_MM,
+    FINGER_RADIUS_MM,
+    NEEDLE_THICK_MM,
+    WRIST_RADIUS_MM,
+    clearance_to_pad,
+    links_of,
+)
 from skills.verification.error_draws import Displaced, draw
 from skills.verification.gates import Limits
-from skills.verification.monte_carlo import estimate_success, looked_at, scene_of
+from skills.verification.monte_carlo import estimate_success, in_tissue, looked_at, scene_of
 from skills.verification.probabilities import JUDGE_VERSION, EstimateSettings, EstimateUnder, SuccessEstimate
 from tests.arms import EXACT
 from tests.by_day import some
@@ -588,3 +595,39 @@ def test_50_plans_succeed_as_often_as_in_independent_worlds():
     assert agree >= 45, found
     assert abs(bias) < 3, off
     assert min(found) < 0.3 and max(found) > 0.95
+
+
+# ---- the needle against tissue -------------------------------------------------------------------------------------
+
+
+def test_the_needle_touches_as_a_point_by_point_computation_says():
+    needle_mm = np.full(len(ALONE), 4.0)
+    scene = looked_at(scene_of(ALONE, 0, PAD_TOP_MM, OPENING_RAD, needle_mm=needle_mm), 5)
+    drawn = draw(3, 0, 60, len(scene.phase), suture_point_mm=5.0, needle_rad=radians(10))
+    displaced = drawn.under(UNCALIBRATED, scene.stamps_s)
+    (found,) = in_tissue(scene, [displaced], drawn.turned)
+    assert 0 < found.sum() < len(found)
+    for k in range(60):
+        lowest = []
+        for s in range(len(scene.phase)):
+            grip = handoff.HELD_MM * scene.arms[0].rotation[s][:, 2]
+            planned = grip + ARC_MM @ scene.needle[s].T
+            jaw = displaced.jaw_turn[0, k]
+            there = displaced.tip_mm[0, k, s] + jaw @ grip + ARC_MM @ (jaw @ drawn.turned[k] @ scene.needle[s]).T
+            lowest.append(4.0 + there[:, 2].min() - planned[:, 2].min())
+        assert found[k] == (min(lowest) < 0)
+
+
+@pytest.mark.parametrize(("apart_mm", "touches"), [(2.0, 0), (-0.1, 40), (np.nan, 40), (np.inf, 0)])
+def test_a_needle_that_is_planned_into_tissue_is_in_it_in_every_world(apart_mm: float, touches: int):
+    needle_mm = np.full(len(ALONE), np.inf)
+    needle_mm[30] = apart_mm
+    found = judged(needle_mm=needle_mm, settings=NO_DOUBT, errors=EXACT)
+    assert (under(found).passes[0].faults.needle, under(found).plan.count) == (touches, 40 - touches)
+
+
+def test_errors_of_an_arm_that_is_not_planned_cost_nothing_and_are_not_listed():
+    alone = judged(motion(1, with_a2=False), approach=None, errors=UNCALIBRATED)
+    assert {one.error for one in alone.costs} == {"wrist_deg", "tip_bias_mm", "tip_noise_mm", "needle"}
+    beside = judged(motion(1, PSM_M), errors=UNCALIBRATED)
+    assert {"registration_mm", "registration_deg"} < {one.error for one in beside.costs}

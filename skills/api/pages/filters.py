@@ -6,8 +6,10 @@ from functools import lru_cache
 from math import degrees
 
 from skills.arrays import Floats
+from skills.db.models import Surgeon, SutureType
 from skills.library.operation.styles import StyleState
 from skills.library.plans.headline import describe_error
+from skills.schemas.people import SurgeonIn, SutureTypeIn
 
 MISSING = "–"
 STATE_MARKS = {"released": "●", "trained": "◐", "stored": "○", "empty": "·"}
@@ -121,7 +123,14 @@ def points(way: Floats) -> str:
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in way.tolist())
 
 
+def as_request(row: Surgeon | SutureType) -> dict[str, object]:
+    """Return the fields of the request that would make a row as it is, as JSON, and its slug."""
+    model = SurgeonIn if isinstance(row, Surgeon) else SutureTypeIn
+    return {"slug": row.slug, **model.model_validate(row, from_attributes=True).model_dump(mode="json")}
+
+
 FILTERS = {
+    "as_request": as_request,
     "px": px,
     "points": points,
     "number": number,

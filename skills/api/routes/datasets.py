@@ -46,5 +46,5 @@ def get_dataset_episodes(dataset: Digest, db: Db, give: Giving) -> Response:
 @router.delete("/datasets/{dataset}", **ends("trainer", 404))
 def delete_dataset(dataset: Digest, db: Db, actor: Actor) -> None:
     """Delete a dataset and the job that made it; its demonstrations stay."""
-    with db.writing() as session:
+    with db.ending() as session:
         datasets.delete_dataset(session, dataset, actor)

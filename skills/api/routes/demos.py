@@ -136,7 +136,7 @@ def mark_demo(demo: Digest, body: OutcomeIn, db: Db, give: Giving, actor: Actor,
     """
     with db.reading() as session:
         surgeon = demos.find_demo(session, demo).surgeon.slug
-    with db.writing([locks.surgeon(surgeon)]) as session:
+    with db.ending([locks.surgeon(surgeon)]) as session:
         conditions.refuse_changed(Demonstration.model_validate(demos.find_demo(session, demo)))
         return give(Demonstration.model_validate(demos.mark_demo(session, demo, body.outcome, body.reason, actor)))
 
@@ -152,7 +152,7 @@ def withdraw_demo(demo: Digest, db: Db, jobs: Jobs, caller: Asking, conditions: 
         conditions.refuse_changed(Demonstration.model_validate(found))
         surgeon, erased = found.surgeon.slug, erasure.erased_with(session, found.surgeon, found) if erase else []
     drop_contents(db, erased)
-    with db.writing(None if erase else [locks.surgeon(surgeon)]) as session:
+    with db.ending(None if erase else [locks.surgeon(surgeon)]) as session:
         conditions.refuse_changed(Demonstration.model_validate(demos.find_demo(session, demo)))
         demos.withdraw_demo(session, demo, caller.name)
         if erase:

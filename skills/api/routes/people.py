@@ -23,7 +23,9 @@ Search = Annotated[str | None, Query(min_length=1, max_length=64, pattern=LINE)]
 @router.put("/surgeons/{surgeon}", **makes("admin", Surgeon, 410, 412))
 def put_surgeon(surgeon: Slug, body: SurgeonIn, db: Db, actor: Actor, conditions: Conditional) -> Response:
     """Create or replace a surgeon under a pseudonym; fields that are left out are cleared."""
-    with db.writing([locks.surgeon(surgeon)]) as session:
+    with db.reading() as session:  # a change may withdraw a consent
+        write = db.writing if surgeons.known_surgeon(session, surgeon) is None else db.ending
+    with write([locks.surgeon(surgeon)]) as session:
         known = surgeons.known_surgeon(session, surgeon)
         conditions.refuse_changed(known and Surgeon.model_validate(known))
         row, created = surgeons.put_surgeon(session, surgeon, body, actor)
@@ -55,7 +57,7 @@ def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, conditions: I
         conditions.refuse_changed(Surgeon.model_validate(found))
         recordings = erasure.erased_with(session, found)
     drop_contents(db, recordings)
-    with db.writing() as session:
+    with db.ending() as session:
         conditions.refuse_changed(Surgeon.model_validate(surgeons.find_surgeon(session, surgeon)))
         dropped = erasure.erase_surgeon(session, surgeon, actor)
     sweep_erased(db)
@@ -118,7 +120,7 @@ def make_key(body: KeyIn, db: Db, actor: Actor, callers: Callers) -> Response:
 @key_router.delete("/keys/{key}", **says("admin", Key, 404))
 def end_key(key: KeyId, db: Db, actor: Actor, callers: Callers) -> Response:
     """Revoke a key permanently: it is refused from now on, and sign-ins with it end."""
-    with db.writing() as session:
+    with db.ending() as session:
         revoked = about_key(revoke_key(session, key, actor))
     callers.forget()
     return say(revoked)

@@ -145,7 +145,7 @@ def withdraw(surgeon: Slug, suture: Slug, db: Db, encoded: Encoder, actor: Actor
 
     `If-Match` takes the ETag of the JSON that is served now.
     """
-    with db.writing([locks.surgeon(surgeon)]) as session:
+    with db.ending([locks.surgeon(surgeon)]) as session:
         _refuse_overtaken(session, encoded, surgeon, suture, if_match)
         who, what = find_surgeon(session, surgeon), find_suture_type(session, suture)
         releases.withdraw(session, who, what.slug, actor)

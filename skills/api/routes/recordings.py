@@ -85,7 +85,7 @@ def delete_recording(recording: Digest, db: Db, caller: Asking) -> None:
         stored, alone = erasure.deletable_recording(session, recording, caller.name, as_admin=as_admin)
     recording = stored.sha256  # in full: the argument may be a prefix
     drop_contents(db, [stored.row] if alone else [])
-    with db.writing([locks.recording(recording)]) as session:
+    with db.ending([locks.recording(recording)]) as session:
         erasure.delete_recording(session, recording, caller.name, as_admin=as_admin)
     sweep_erased(db)
     db.forget()

@@ -298,7 +298,8 @@ def _decoded_otherwise(database: Database, row: int, tell: Parser) -> Why:
         return
     parts = ("recording", "proposed", "identifications", "bases")
     if not all(alike(getattr(kept, part), getattr(again, part)) for part in parts):
-        yield "its cached content differs from its bytes; delete its row of parsed_recordings, which is written again"
+        rows = "parsed_chunks and parsed_recordings"
+        yield f"its cached content differs from its bytes; delete its rows of {rows}, which are written again"
 
 
 # ---- policies computed and learnt again ------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from time import monotonic
 from typing import Any, cast
 
 from sqlalchemy import Select, Table, delete, exists, or_, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from skills.db import models, now
 from skills.db.models import (
@@ -42,7 +42,7 @@ JOBS_AT_ONCE = 300
 FEWEST_JOBS = 20
 HELD_S = 0.05  # ours: half of the time for which nothing may hold SQLite's one lock
 PICTURES_AT_ONCE = 10
-UNDIVIDED_S = 600.0  # ours: the styles of a batch are added within seconds, or its request was interrupted
+UNDIVIDED_S = 60.0  # ours: some styles of a batch are added each second, or its request was interrupted
 STEADY_S = 3600.0  # ours: retentions are of a year, so an hour more changes nothing
 STEP_S = 60.0  # ours: a larger difference is no correction of a clock that was right
 _JOBS = cast(Table, Job.__table__)  # bare: who erases need not be allowed to see all that is left
@@ -88,6 +88,7 @@ def sweep(database: Database, settings: Settings, at_most_s: float = inf, *, by_
         Whether nothing is left to delete.
     """
     began_s = monotonic()
+    database.reserve_space()
     _fail_undivided(database)
     return all(monotonic() - began_s <= at_most_s for _ in _steps(database, settings, by_age))
 
@@ -131,7 +132,7 @@ def _drop_content(database: Database, recording_row: int) -> bool:
         sha256 = session.scalar(select(StoredRecording.sha256).where(StoredRecording.row == recording_row))
     if sha256 is None:
         return False
-    with database.writing([locks.recording(sha256)]) as session:
+    with database.ending([locks.recording(sha256)]) as session:
         unfinished = update(entry).where(entry.recording_row == recording_row).values(version=UNFINISHED)
         session.execute(unfinished, **UNSYNCHRONISED)
         mine = of.recording_row == recording_row
@@ -143,7 +144,7 @@ def _drop_content(database: Database, recording_row: int) -> bool:
 def _sweep_chunks(database: Database) -> bool:
     """Delete some chunks that are due; return whether there were any."""
     at_once = AT_ONCE_BYTES // CHUNK_BYTES
-    with database.writing([locks.SWEEP]) as session:
+    with database.ending([locks.SWEEP]) as session:
         row = session.scalar(select(LooseChunks.recording_row).where(LooseChunks.due_at <= now()).limit(1))
         if row is None:
             return False
@@ -169,7 +170,7 @@ def _sweep_jobs(database: Database) -> Iterator[None]:
             rows = session.scalars(_jobs_of(surgeon_row)).all()
         done, at_once = 0, max(JOBS_AT_ONCE // 4, 1)  # more where steps turn out to be fast
         while done < len(rows):
-            with database.writing([locks.SWEEP]) as session:
+            with database.ending([locks.SWEEP]) as session:
                 session.connection()
                 began_s = monotonic()
                 session.execute(delete(_JOBS).where(_JOBS.c.row.in_(rows[done : done + at_once])))
@@ -177,7 +178,7 @@ def _sweep_jobs(database: Database) -> Iterator[None]:
             share = HELD_S / max(monotonic() - began_s, 1e-6)
             at_once = min(max(int(at_once * min(share, 2.0)), FEWEST_JOBS), JOBS_AT_ONCE)
             yield
-        with database.writing([locks.SWEEP]) as session:
+        with database.ending([locks.SWEEP]) as session:
             theirs = delete(ErasedSurgeon).where(ErasedSurgeon.surgeon_row == surgeon_row)
             session.execute(theirs, **UNSYNCHRONISED)
         yield
@@ -190,7 +191,9 @@ def _jobs_of(surgeon_row: int) -> Select[int]:
 def _fail_undivided(database: Database) -> None:
     """Fail the batches to which nobody adds styles any more."""
     long_ago = now() - timedelta(seconds=UNDIVIDED_S)
-    waiting = (Job.kind == BATCH, Job.state.in_(ACTIVE), Job.submitted_at.is_(None), Job.created_at < long_ago)
+    part, of = aliased(Job), StyleToRetrain
+    lately = exists().where(of.job_row == Job.row, of.part_row == part.row, part.created_at >= long_ago)
+    waiting = (Job.kind == BATCH, Job.state.in_(ACTIVE), Job.submitted_at.is_(None), Job.created_at < long_ago, ~lately)
     with database.reading() as session:
         rows = session.scalars(select(Job.row).where(*waiting)).all()
     for row in rows:

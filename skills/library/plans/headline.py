@@ -5,6 +5,8 @@ level, for a colour: `good` requires that the plan hands the needle over and suc
 stated errors of the arms.
 """
 
+from typing import NamedTuple
+
 from skills.errors import Conflict
 from skills.library.plans.description import describe_motion
 from skills.schemas.plans import PlanDescription
@@ -14,6 +16,10 @@ from skills.verification.probabilities import JUDGE_VERSION, EstimateUnder, Prob
 from skills.verification.probabilities import NEEDLE as NEEDLE_ERROR
 
 CHECK_VERSION = 1  # part of the job's identity: raise it when verdicts change, so that plans can be played again
+# The event of a probability: of the whole plan, of a pass, and of many worlds.
+EVENTS = {"hand-over": "the complete plan succeeds", "clearance": "the motion stays within reach and clear"}
+OF_A_PASS = {"hand-over": "succeeds", "clearance": "stays within reach and clear"}
+OF_WORLDS = {"hand-over": "succeed", "clearance": "stay within reach and clear"}
 _LEFT_OUT = {"place": "a hand-off", "arms": "the other arm", "pad": "tissue"}  # by the fault that was not judged
 
 
@@ -32,31 +38,62 @@ def headline(plan: PlanDescription, report: Verdict, *, errors: ArmErrors, lower
         errors: The errors that the installation states now; a playback whose request stated its own keeps those.
         lower_bound: The value that the lower bound of the entire plan's probability has to reach for the level `good`.
     """
-    feasible = report.feasible
-    try:
-        under = judged_under(report, errors)
-    except Conflict as unjudged:
-        whole, name, most, odds = None, errors.name, None, f". {unjudged.words()}"
-        counts: CountedEvent | None = None
-        left_out: list[str] = []
+    said = _Estimated() if not report.feasible else _estimated(plan, report, errors)
+    level = _level(plan, report.feasible, said.probability, lower_bound)
+    word = _word(plan, report.feasible, level)
+    if not report.feasible:
+        verdict = str(report.failure_sentence)
+    elif said.estimate is None:
+        verdict = f"feasible in an exact simulation. {said.unjudged}"
     else:
-        whole, name, most = under.plan, under.errors.name, costs_most(report)
-        counts, left_out = counted_as(under), not_judged(under)
-        odds = f"; {_odds(under)}{'' if most is None else f' {most}'}"
-    level = _level(plan, feasible, whole, lower_bound)
-    word = _word(plan, feasible, level)
-    exact = f"feasible in an exact simulation{odds}"
-    verdict = exact if feasible else report.failure_sentence
+        verdict = " ".join(filter(None, [f"feasible in an exact simulation; {said.estimate}", said.costs_most]))
     return Headline(
         level=level,
         word=word,
         text=f"{word}: {verdict} {describe_motion(plan)}",
-        errors=name,
-        probability=whole,
-        counts=counts,
-        not_judged=left_out,
-        costs_most=most,
+        errors=said.errors or errors.name,
+        probability=said.probability,
+        counts=said.counts,
+        event=None if said.counts is None else EVENTS[said.counts],
+        estimate=said.estimate,
+        under=[*said.under],
+        not_judged=[*said.not_judged],
+        costs_most=said.costs_most,
     )
+
+
+class _Estimated(NamedTuple):
+    """The probability of a headline, and the sentences on it; of a plan that is not feasible there is none."""
+
+    errors: str | None = None
+    probability: Probability | None = None
+    counts: CountedEvent | None = None
+    estimate: str | None = None
+    under: tuple[str, ...] = ()
+    not_judged: tuple[str, ...] = ()
+    costs_most: str | None = None
+    unjudged: str = ""
+
+
+def _estimated(plan: PlanDescription, report: Verdict, errors: ArmErrors) -> _Estimated:
+    try:
+        stated = judged_under(report, errors)
+    except Conflict as unjudged:
+        return _Estimated(unjudged=unjudged.words())
+    counts, left_out = counted_as(stated), not_judged(plan, stated)
+    whole, name = stated.plan, stated.errors.name
+    estimate = (
+        f"with {describe_errors(name)} {EVENTS[counts]} in {whole.count} of {whole.of} worlds: "
+        f"{_percent(whole.probability)} ({_percent(whole.lower)} to {_percent(whole.upper)}, 95 %)."
+    )
+    if left_out != [_NEVER_JUDGED]:
+        estimate = f"{estimate} Not judged: {', '.join(left_out)}."
+    under = tuple(
+        f"{one.errors.name}: {one.errors.describe()}; every pass {OF_A_PASS[counts]} with a probability of at least "
+        f"{min((each.succeeds.lower for each in one.passes), default=0.0):.3f} (95 %)"
+        for one in report.estimate.under
+    )
+    return _Estimated(name, whole, counts, estimate, under, tuple(left_out), costs_most(report))
 
 
 def judged_under(report: Verdict, errors: ArmErrors) -> EstimateUnder:
@@ -94,7 +131,7 @@ def costs_most(report: Verdict) -> str | None:
             f"Without any single error of the arms it is not more: the rest is lost by {beside}several errors together."
         )
     share = _percent(first.without.probability)
-    well = "succeed" if counted_as(doubted.under[0]) == "hand-over" else "stay clear"
+    well = OF_WORLDS[counted_as(doubted.under[0])]
     return f"Most is lost by {describe_error(first.error)}: without it {share} of the worlds {well}."
 
 
@@ -128,24 +165,17 @@ def counted_as(under: EstimateUnder) -> CountedEvent:
     return "hand-over" if _judged_in_all(under, "place") else "clearance"
 
 
-def not_judged(under: EstimateUnder) -> list[str]:
+def not_judged(plan: PlanDescription, under: EstimateUnder) -> list[str]:
     """Return, in words, the parts of a plan's success that its probability leaves out."""
-    return [words for fault, words in _LEFT_OUT.items() if not _judged_in_all(under, fault)] + [_NEVER_JUDGED]
+    beside = plan.scene is not None and (plan.scene.scene.boxes or plan.scene.scene.capsules)
+    obstacles = ["the stated obstacles"] if beside else []
+    left_out = [words for fault, words in _LEFT_OUT.items() if not _judged_in_all(under, fault)]
+    return [*left_out, *obstacles, _NEVER_JUDGED]
 
 
 def _judged_in_all(under: EstimateUnder, fault: str) -> bool:
     passes = under.passes
     return bool(passes) and all(getattr(one.faults, fault) is not None for one in passes)
-
-
-def _odds(under: EstimateUnder) -> str:
-    whole, left_out = under.plan, not_judged(under)
-    of = "the complete plan succeeds" if counted_as(under) == "hand-over" else "the motion stays within reach and clear"
-    said = (
-        f"with {describe_errors(under.errors.name)} {of} in {whole.count} of {whole.of} worlds: "
-        f"{_percent(whole.probability)} ({_percent(whole.lower)} to {_percent(whole.upper)}, 95 %)."
-    )
-    return said if left_out == [_NEVER_JUDGED] else f"{said} Not judged: {', '.join(left_out)}."
 
 
 def describe_errors(name: str) -> str:

@@ -30,7 +30,7 @@ from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VER
 from skills.library.operation import proofs
 from skills.library.operation.integrity import learnt, learnt_in, planned
 from skills.library.plans.description import describe_motion, describe_plan
-from skills.library.plans.headline import counted_as, describe_errors, not_judged
+from skills.library.plans.headline import OF_WORLDS, counted_as, describe_errors, not_judged
 from skills.library.plans.plans import find_plan
 from skills.library.plans.replay_gate import ReplayConditions, cleared
 from skills.library.policies.combined import learnt_from
@@ -141,16 +141,15 @@ def _readme(row: Plan, about: PlanDescription, report: Verdict, arms: tuple[ArmM
     """Return the text of the bag's README: its contents, and the figures of each arm to check before it moves."""
     under, policy = report.estimate.under[0], row.policy
     errors = under.errors
-    well = "succeed" if counted_as(under) == "hand-over" else "stay within reach and clear"
     lines = [
         f"A needle hand-off for replay: plan {row.sha256},",
         f"surgeon {policy.surgeon.slug}, {policy.suture}, policy version {policy.version}.",
         describe_motion(about),
         "",
-        f"Every pass is likely enough to {well} with {describe_errors(errors.name)}, "
+        f"Every pass is likely enough to {OF_WORLDS[counted_as(under)]} with {describe_errors(errors.name)}, "
         f"as the {report.stated_by} stated them:",
         f"{errors.describe()}.",
-        f"Not judged: {', '.join(not_judged(under))}.",
+        f"Not judged: {', '.join(not_judged(about, under))}.",
         "With greater errors it was not judged: compare these with your arms.",
         "",
         USE,

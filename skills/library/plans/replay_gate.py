@@ -12,7 +12,7 @@ from skills.errors import Conflict, Corrupt
 from skills.library.operation.integrity import planned
 from skills.library.people import consent
 from skills.library.plans.arm_errors import stated_errors
-from skills.library.plans.headline import costs_most, describe_errors, judged_under
+from skills.library.plans.headline import OF_WORLDS, costs_most, counted_as, describe_errors, judged_under
 from skills.library.policies import releases, versions
 from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan
 from skills.remedies import Action, Remedy
@@ -139,7 +139,8 @@ def check_probability(report: Verdict, *, errors: ArmErrors, lower_bound: float)
     if not least >= lower_bound:
         most = costs_most(report)
         raise Conflict(
-            f"With {describe_errors(under.errors.name)} a pass of this plan may succeed with a probability of "
+            f"With {describe_errors(under.errors.name)} a pass of this plan may {OF_WORLDS[counted_as(under)]} with a "
+            f"probability of "
             f"only {least:.3f}, and {lower_bound:g} is required.{'' if most is None else f' {most}'} Register and "
             "calibrate the arms, state their own errors, and play the plan again.",
             least=least,

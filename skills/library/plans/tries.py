@@ -6,14 +6,14 @@
 Cell size and hysteresis are chosen by the measured loss: the coarsest cells of at most the paper's 5 mm that lose at
 most the stated amount, with hysteresis where the path trembles without it. The service cannot know the hand-off that is
 meant, the height of the tissue, the errors of the arms, and whether to release; it asks for what the request leaves
-open, and the job ends there. Nothing is released unless the request says so.
+open, and the job ends there. Nothing is released unless the request says so and the plan is feasible.
 
 Each step is stored by its use case before the next one begins, so a try that is sent again, with an answer or after a
 failure, finds what it stored before.
 """
 
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from math import ceil
@@ -37,7 +37,6 @@ from skills.library.operation.jobs import JobRequest, RequestedJob, Store
 from skills.library.people.consent import require
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
-from skills.library.plans.headline import describe_errors
 from skills.library.plans.plans import hand_of, plan_sutures
 from skills.library.plans.playbacks import (
     check_playback,
@@ -166,12 +165,14 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         if questions := _questions(asked, passes):
             yield from questions
             return
-        yield _release(database, version, actor, settings, wanted=asked.release is True, passes=passes)
         at = "plan"
         plan, words = _plan(database, asked, version, actor)
         yield _done("plan", words, plan)
         at = "play"
-        yield from _play(database, asked, plan, actor, settings, others)
+        feasible = yield from _play(database, asked, plan, actor, settings, others)
+        yield _release(
+            database, version, actor, settings, wanted=asked.release is True, passes=passes, feasible=feasible
+        )
     except SkillsError as refused:
         if isinstance(least_mm := refused.numbers.get("least_mm"), float):
             reached_mm = ceil(10 * least_mm) / 10
@@ -395,12 +396,20 @@ def _questions(asked: TryIn, passes: bool) -> list[TryStep]:
 
 
 def _release(
-    database: Database, version: PolicyVersion, actor: str, settings: Settings, *, wanted: bool, passes: bool
+    database: Database,
+    version: PolicyVersion,
+    actor: str,
+    settings: Settings,
+    *,
+    wanted: bool,
+    passes: bool,
+    feasible: bool,
 ) -> TryStep:
-    """Release a version if that is wanted and it passes the gate; a refusal does not end the try."""
-    if not (wanted and passes):
-        why = "as requested" if passes else "since it does not pass the gate"
-        return _done("release", f"Version {version.version} is not released, {why}; the plan uses it all the same.")
+    """Release a version if that is wanted, it passes the gate, and its plan is feasible; a refusal ends no try."""
+    if not (wanted and passes and feasible):
+        plan = "its plan is not feasible; release it by its number if it is to be served all the same"
+        why = "it does not pass the gate" if not passes else "that was not requested" if not wanted else plan
+        return _done("release", f"Version {version.version} is not released: {why}.")
     try:
         with database.writing([locks.surgeon(version.surgeon.slug)]) as session:
             stored = session.get_one(PolicyVersion, version.row)
@@ -435,8 +444,8 @@ def _plan(database: Database, asked: TryIn, version: PolicyVersion, actor: str) 
 
 def _play(
     database: Database, asked: TryIn, plan: str, actor: str, settings: Settings, others: Sequence[Choice]
-) -> Iterator[TryStep]:
-    """Play a plan in the simulator; yield the step of the playback, and that of the verdict."""
+) -> Generator[TryStep, None, bool]:
+    """Play a plan in the simulator; yield the step of the playback, and that of the verdict; return if feasible."""
     store = check_playback(database, playback_request(plan, settings, asked.arm_errors), settings)
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
         playback = store(session, actor).playback
@@ -444,8 +453,7 @@ def _play(
         row = find_playback(session, playback)
         line, report = headline_of(row, settings), row.report
         lowest_mm = min(z for one in row.plan.about.passes for _, _, z in one.path_mm)
-    errors = describe_errors(report.estimate.under[0].errors.name)
-    yield _done("play", f"{report.samples} samples in the simulator, and 1000 worlds with {errors}.", playback)
+    yield _done("play", f"{report.samples} samples in the simulator.", playback)
     verdict = _done("verdict", line.text, playback)
     if line.level == "bad" and report.failure is None and asked.errors == "uncalibrated":
         words = "judge it with the errors of a calibrated arm, if yours is one"
@@ -459,3 +467,4 @@ def _play(
         )
         others, verdict = (), verdict.model_copy(update={"remedies": (measure,)})
     yield verdict.model_copy(update={"choices": tuple(others)})
+    return report.feasible

@@ -292,7 +292,7 @@ def _compared(
         served = measured.served
         comparison = compare(figures(served.version, served.sha256, served.manifest), trained, measured.fit)
     if batch.request.release:
-        comparison = _release(session, stored.row, comparison, batch.requested_by)
+        comparison = _release(session, stored.row, comparison, batch)
     return comparison
 
 
@@ -342,12 +342,13 @@ def _worse(released: PolicyFigures, trained: PolicyFigures, fit: FitOnTheSame) -
         yield f"a start follows {after:.1%} of the demonstration on average against {before:.1%}"
 
 
-def _release(session: Session, policy: int, comparison: StoredComparison, actor: str) -> StoredComparison:
+def _release(session: Session, policy: int, comparison: StoredComparison, batch: _Batch) -> StoredComparison:
     if comparison.worse_because:
         because = f"It is worse than the released version: {'; '.join(comparison.worse_because)}."
         advice = "Release it by its number if it is to replace the released version anyway."
         return replace(comparison, not_released_because=because, remedy=advice)
-    made = releases.try_release(session, session.get_one(PolicyVersion, policy), actor)
+    version, turn_deg = session.get_one(PolicyVersion, policy), batch.settings.constant_turn_deg
+    made = releases.try_release(session, version, batch.requested_by, turn_deg)
     return replace(
         comparison,
         now_released=made.released,

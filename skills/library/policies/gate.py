@@ -18,7 +18,7 @@ from skills.learning.dynamic_programming import FAINT
 from skills.learning.policy import Policy
 from skills.learning.pose_step import near_share
 from skills.learning.tube import CertifiedPoses
-from skills.planning.plan import DrivenPass, driven_pass
+from skills.planning.plan import CONSTANT_TURN_DEG, DrivenPass, driven_pass
 from skills.schemas.policies import GateRefusal, RefusalKind
 from skills.settings import Settings
 
@@ -46,6 +46,7 @@ class GateLimits(NamedTuple):
 
     near: NearLimits = NearLimits()
     odds: OddsLimits = OddsLimits()
+    constant_turn_deg: float = CONSTANT_TURN_DEG
 
     @classmethod
     def of(cls, settings: Settings) -> "GateLimits":
@@ -53,6 +54,7 @@ class GateLimits(NamedTuple):
         return cls(
             NearLimits(settings.near_radius_mm, settings.near_least_share),
             OddsLimits(settings.scene_least_finishing, settings.scene_most_touching),
+            settings.constant_turn_deg,
         )
 
 

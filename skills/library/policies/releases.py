@@ -209,12 +209,12 @@ class Released(NamedTuple):
 NOT_REQUESTED = Released(False, None, None)
 
 
-def try_release(session: Session, policy: PolicyVersion, actor: str) -> Released:
+def try_release(session: Session, policy: PolicyVersion, actor: str, constant_turn_deg: float) -> Released:
     """Release a policy version if it passes the gate, as `release` does; return why it was not released."""
     if (without := consent.refusal(policy.surgeon, "training")) is not None:
         return Released(False, without.words(), remedy([GateRefusal("consent", without.message)]))
     try:
-        release(session, policy, actor)
+        release(session, policy, actor, constant_turn_deg=constant_turn_deg)
     except Conflict as refused:
         return Released(False, refused.message, " ".join(refused.advice(None)))
     return Released(True, None, None)

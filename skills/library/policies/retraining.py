@@ -86,9 +86,9 @@ def request_retraining(
         who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
         requested = jobs.ask(session, request, who, actor)
         job = requested.job
-        if not requested.new:
+        if not requested.new and (job.submitted_at is not None or job.state not in jobs.ACTIVE):
             return requested if job.state != "succeeded" or not request.release else _done_before(session, job)
-    # Rows are inserted only for a new job; an equal one has its own.
+    # An equal job that lacks some of its rows, because its request is under way or was interrupted, gets them here.
     size = max(1, min(MOST_IN_A_PART, -(-len(styles) // FEWEST_PARTS)))
     at_once = STYLES_AT_ONCE // size * size
     for first in range(0, len(styles), at_once):
@@ -102,6 +102,8 @@ def request_retraining(
         told = session.get(Job, job.row)
     if told is None:
         raise Conflict("The surgeon was erased while the batch was requested.")
+    if not requested.new:
+        return RequestedJob(told, True, "An equal job is queued already; the rest of its styles were added to it.")
     if not styles:
         return RequestedJob(told, True, "Nothing: no style needs training.")
     counted = f"{len(styles)} {'style' if len(styles) == 1 else 'styles'}"
@@ -278,10 +280,13 @@ def _differences(
 
 
 def _divide(session: Session, job: Job, styles: Sequence[tuple[int, list[str]]], size: int) -> None:
-    """Insert a row for each of some styles, and divide them into parts; a demonstration that was erased is left out."""
-    demos = [row for row, _ in styles]
+    """Insert the missing rows of some styles, and divide them into parts; an erased demonstration is left out."""
+    demos, of = [row for row, _ in styles], StyleToRetrain
     there = set(session.scalars(select(Demonstration.row).where(Demonstration.row.in_(demos))))
+    there -= set(session.scalars(select(of.demonstration_row).where(of.job_row == job.row)))
     left = [(row, stale) for row, stale in styles if row in there]
+    if not left:
+        return
     parts = [
         # without its request and identity, which name its row
         Job(

@@ -70,7 +70,7 @@ def request_training(
     requested = jobs.ask(session, request, who, actor)
     if requested.new or not training.release or requested.job.state != "succeeded":
         return requested
-    return requested._replace(did=_release_again(session, requested.job, actor))
+    return requested._replace(did=_release_again(session, requested.job, actor, limits.constant_turn_deg))
 
 
 def training_request(session: Session, training: TrainingIn, limits: GateLimits) -> tuple[TrainingRequest, Surgeon]:
@@ -134,7 +134,7 @@ def _refuse_depth_along(depth_along: Sequence[float], learner: Learner, frame: s
     rule_in(frame, depth_along)
 
 
-def _release_again(session: Session, job: Job, actor: str) -> str:
+def _release_again(session: Session, job: Job, actor: str, constant_turn_deg: float) -> str:
     """Release the version of a finished training unless its style serves it already; return the effect in words."""
     assert job.result is not None, "it has succeeded"
     result = TrainingResult.model_validate(job.result)
@@ -142,7 +142,7 @@ def _release_again(session: Session, job: Job, actor: str) -> str:
     served = releases.served(session, version.surgeon, version.suture)
     if served is not None and served.policy_row == version.row:
         return f"Nothing: the style serves version {version.version} already."
-    released = releases.try_release(session, version, actor)
+    released = releases.try_release(session, version, actor, constant_turn_deg)
     job.result = result.model_copy(update=released._asdict()).model_dump()
     session.flush()
     because = released.not_released_because
@@ -161,7 +161,9 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
 
     def store(session: Session, actor: str) -> TrainingResult:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)
-        released = releases.try_release(session, version, actor) if request.release else releases.NOT_REQUESTED
+        released = releases.NOT_REQUESTED
+        if request.release:
+            released = releases.try_release(session, version, actor, settings.constant_turn_deg)
         return TrainingResult(
             policy_version=version.version,
             sha256=version.sha256,

@@ -95,13 +95,15 @@ def put_entry(session: Session, recording_row: int, entry: Entry) -> None:
 
 
 def _replace(session: Session, recording_row: int, entry: Entry, version: int) -> None:
-    session.execute(delete(ParsedRecording).where(ParsedRecording.recording_row == recording_row))
+    # Both, because the sqlite3 program deletes an entry without its chunks.
+    for table in (ParsedChunk, ParsedRecording):
+        session.execute(delete(table).where(table.recording_row == recording_row))
     about = {"version": version, "reading": entry.reading, "sha256": entry.sha256}
     session.execute(insert(ParsedRecording), {"recording_row": recording_row, **about})
 
 
-def cache_content(database: Database, stored: StoredRecording, entry: Entry) -> None:
-    """Store the entry of a stored recording, unless the recording was erased meanwhile.
+def cache_content(database: Database, stored: StoredRecording, entry: Entry, *, damaged: bool = False) -> None:
+    """Store the entry of a stored recording, unless one that is not `damaged` is there, or the recording was erased.
 
     A large one is stored in several short transactions; its row gets its version in the last. Two callers may write the
     same content at once: each adds the chunks that are missing.
@@ -115,9 +117,9 @@ def cache_content(database: Database, stored: StoredRecording, entry: Entry) -> 
             if not entry.is_large:
                 put_entry(session, stored.row, entry)
                 return
-            if is_cached(session, stored):
+            if not damaged and is_cached(session, stored):
                 return
-            if session.scalar(select(ParsedRecording.recording_row).where(*mine)) is None:
+            if damaged or session.scalar(select(ParsedRecording.recording_row).where(*mine)) is None:
                 _replace(session, stored.row, entry, UNFINISHED)
         for start in range(0, len(entry.data), AT_ONCE_BYTES):
             with database.writing(names) as session:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from functools import partial
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO, TypeVar, cast
 
 from sqlalchemy import Select, delete, select, text, update
 from sqlalchemy.orm import Session
@@ -30,7 +30,16 @@ from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
-from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
+from skills.errors import (
+    BadInput,
+    Busy,
+    Conflict,
+    Corrupt,
+    SkillsError,
+    TooLarge,
+    UnknownFormat,
+    UnreadableRecording,
+)
 from skills.formats import MEDIA_TYPES, media_type_of
 from skills.formats.parsed import ParsedContent, parse_recording
 from skills.formats.reader_process import ConfinedReader
@@ -54,6 +63,28 @@ BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have
 DUE_S = 3600.0  # ours: an upload under way stores its next piece within seconds
 
 
+class SharedReading:
+    """The outcome of the one reading of equal uploads that are handled at once."""
+
+    def __init__(self) -> None:
+        self.outcome: tuple[TableIn, Recording | ParsedContent | SkillsError] | None = None
+
+    def read(self, read: Callable[..., Content], file: BinaryIO, reading: TableIn) -> Content:
+        """Read a file unless one with its bytes was read with equal parameters; return the content or raise a refusal.
+
+        That the reader is busy is not an outcome: the next upload tries again.
+        """
+        if self.outcome is None or self.outcome[0] != reading:
+            try:
+                self.outcome = reading, read(file, **reading.options)
+            except (BadInput, UnknownFormat, TooLarge) as refusal:
+                self.outcome = reading, refusal
+        _, outcome = self.outcome
+        if isinstance(outcome, SkillsError):
+            raise outcome
+        return cast(Content, outcome)
+
+
 @dataclass(frozen=True)
 class Upload:
     """An upload, spooled to a file: its SHA-256, and the reading parameters that the format itself does not contain."""
@@ -64,6 +95,7 @@ class Upload:
     media_type: str
     vouched: bool = False  # the client sent a Content-Digest, and it matches the bytes
     reading: TableIn = field(default_factory=TableIn)
+    shared: SharedReading = field(default_factory=SharedReading, compare=False)
 
     def read_as(self, stated: TableIn) -> "Upload":
         """Return the upload with the reading parameters of a request, which may state more than these."""
@@ -106,7 +138,7 @@ def read_upload(upload: Upload, read: Callable[..., Content]) -> Content:
         raise UnknownFormat(
             f"The content is {MEDIA_TYPES[right]}, which does not match Content-Type; send it as {right}."
         )
-    found = read(upload.file, **upload.reading.options)
+    found = upload.shared.read(read, upload.file, upload.reading)
     recording = found.recording if isinstance(found, ParsedContent) else found
     if recording.format in BAGS and recording.integrity == "none" and not upload.vouched:
         raise UnreadableRecording(
@@ -365,11 +397,12 @@ def stored_recording(
                 if intact:
                     deque(recording_bytes(session, stored), maxlen=0)
                 return cached
+            damaged = is_cached(session, stored)
             file.writelines(recording_bytes(session, stored))
         parsed = parse(file, **stored.reading.options)
     entry = entry_of(stored, parsed)
     if entry is not None:
-        cache_content(database, stored, entry)
+        cache_content(database, stored, entry, damaged=damaged)
     return parsed
 
 

@@ -17,6 +17,7 @@ from skills.db.session import Database
 from skills.errors import NotFound
 from skills.library.operation.integrity import planned
 from skills.library.people.recorded import recording_for, shown_recording
+from skills.library.plans.headline import OF_A_PASS, counted_as, describe_errors
 from skills.library.plans.plans import find_plan, followed_plan, trajectory_of
 from skills.library.policies import versions
 from skills.library.policies.pose_styles import poses_of
@@ -60,9 +61,14 @@ def timeline_of(database: Database, source: Source, sha256: str, parse: Parser) 
         plan = followed_plan(session, sha256)
         motion = planned(plan)
         played = session.scalar(newest(StoredPlayback, StoredPlayback.plan_row == plan.row))
-        measured, passes = (None, ()) if played is None else (played.measured, played.report.estimate.under[0].passes)
-    odds = {number: one.succeeds.probability for number, one in enumerate(passes)}
-    return timeline_of_plan(trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds)
+        measured, odds, event = None if played is None else played.measured, {}, ""
+        if played is not None and played.feasible:
+            under = played.report.estimate.under[0]
+            odds = {number: one.succeeds.probability for number, one in enumerate(under.passes)}
+            event = f"The pass {OF_A_PASS[counted_as(under)]}, {describe_errors(under.errors.name)}"
+    return timeline_of_plan(
+        trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds, event=event
+    )
 
 
 def check_export(session: Session, source: Source, sha256: str) -> None:

@@ -16,11 +16,14 @@ const bodies = {
     return { skill_level: skill.value || null, handedness: handedness.value || null, protocol: protocol.value || null, consent };
   },
   suture(form) {
-    const { name, also_called: also, family, description } = form.elements;
-    const names = also.value.split(",").map((one) => one.trim()).filter(Boolean);
-    return { name: name.value, also_called: names, family: family.value, description: description.value };
+    const { slug, also_called: names, ...fields } = Object.fromEntries(new FormData(form));
+    return { ...fields, also_called: names.split(",").map((one) => one.trim()).filter(Boolean) };
   },
 };
+
+// A change replaces the row: fields that the form does not have stay as they are.
+const kept = {};
+const unchanged = (kind, slug) => (kept[kind]?.slug === slug ? kept[kind].fields : {});
 
 for (const [kind, form] of Object.entries(forms)) {
   form.addEventListener("submit", async (event) => {
@@ -28,7 +31,8 @@ for (const [kind, form] of Object.entries(forms)) {
     const button = form.querySelector("button");
     say(button, "");
     try {
-      await call("PUT", form.dataset.path + form.elements.slug.value, bodies[kind](form));
+      const slug = form.elements.slug.value;
+      await call("PUT", form.dataset.path + slug, { ...unchanged(kind, slug), ...bodies[kind](form) });
       location.reload();
     } catch (problem) {
       say(button, problem.message);
@@ -40,9 +44,14 @@ document.addEventListener("click", (event) => {
   const { fill, values } = event.target.closest(".edit")?.dataset ?? {};
   if (!fill) return;
   const form = forms[fill];
-  const { consent, ...fields } = JSON.parse(values);
-  for (const [name, value] of Object.entries(fields)) form.elements[name].value = value ?? "";
+  const { slug, ...fields } = JSON.parse(values);
+  kept[fill] = { slug, fields };
+  for (const [name, value] of Object.entries({ slug, ...fields })) {
+    const input = form.elements[name];
+    if (input) input.value = Array.isArray(value) ? value.join(", ") : (value ?? "");
+  }
   if (fill === "surgeon") {
+    const { consent } = fields;
     consented.checked = consent !== null;
     form.querySelectorAll('[name="uses"]').forEach((one) => (one.checked = consent?.uses.includes(one.value) ?? false));
     form.elements.until.value = consent?.until ?? "";

@@ -263,7 +263,7 @@ function draws() {
   });
   return [
     ["Speed of the tips, mm/s", speeds, { zero: true, stages: true }], ["Jaws, °", jaws], ["Distances, mm; dotted: the least that is permitted", distances],
-    ["The pass succeeds, %", odds, { range: [0, 100] }], ["Joints that turn, °", joints[0]], ["Insertion, mm", joints[1]],
+    ["Share of worlds in which the pass goes well, %", odds, { range: [0, 100] }], ["Joints that turn, °", joints[0]], ["Insertion, mm", joints[1]],
   ].filter(([, mine]) => mine.length);
 }
 
