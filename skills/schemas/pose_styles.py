@@ -90,8 +90,8 @@ class SessionPose(PoseAnswer):
 
     Attributes:
         newer_version: Another version that was released since; the session keeps its own.
-        late_ms: How long the pose waited in the service, if longer than `limits.late_ms`; otherwise null. An answer
-            after its tick is worse for a robot than none.
+        late_ms: How long the pose waited in the service, if longer than `late_ms` of the limits; otherwise null. An
+            answer after its tick is worse for a robot than none.
     """
 
     newer_version: int | None
