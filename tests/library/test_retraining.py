@@ -117,7 +117,7 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
 
 
 @pytest.mark.parametrize("release", [False, True])
-def test_stale_styles_are_settled_by_a_batch_that_makes_an_older_version_again(database: Database, release: bool):
+def test_stale_styles_are_settled_by_a_batch_that_makes_an_older_version(database: Database, release: bool):
     def stale(**asked: object) -> list[list[str]]:
         return [
             style.stale for style in styles_of(database, retrain(database, only_stale=True, release=release, **asked))

@@ -626,7 +626,7 @@ def test_a_needle_that_is_planned_into_tissue_is_in_it_in_every_world(apart_mm: 
     assert (under(found).passes[0].faults.needle, under(found).plan.count) == (touches, 40 - touches)
 
 
-def test_errors_of_an_arm_that_is_not_planned_cost_nothing_and_are_not_listed():
+def test_errors_of_an_arm_that_is_not_planned_are_not_listed():
     alone = judged(motion(1, with_a2=False), approach=None, errors=UNCALIBRATED)
     assert {one.error for one in alone.costs} == {"wrist_deg", "tip_bias_mm", "tip_noise_mm", "needle"}
     beside = judged(motion(1, PSM_M), errors=UNCALIBRATED)
