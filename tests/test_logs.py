@@ -18,6 +18,7 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.demo import wait_until_ready
 from skills.errors import BadInput
+from skills.jobs import log_faults_alone
 from skills.jobs.worker import logged
 from skills.jobs.workflows import Work
 from skills.settings import Settings
@@ -67,6 +68,7 @@ def test_a_job_that_is_cancelled_while_it_runs_is_no_error_of_the_engine(said: i
     from dbos import _core
     from dbos._error import DBOSAwaitedWorkflowCancelledError
 
+    log_faults_alone()
     engine = logging.getLogger("dbos")
     for adopted in ("the owner's recorded outcome", "the recorded outcome"):
         assert f"Waiting for {adopted}" in inspect.getsource(_core)

@@ -110,11 +110,11 @@ def open_engine(url: str, patience_ms: int) -> Engine:
 
 def _forgotten(connection: Connection) -> bool:
     """Delete the notes for the history that others have left; return whether there is a history."""
-    try:
-        connection.exec_driver_sql(FORGET_NOTES)
-    except OperationalError as error:
-        if "no such table" not in str(error.orig):
-            raise
+    try:  # by the driver: SQLAlchemy would end the transaction that has just begun, in which a migration is to be whole
+        connection.connection.cursor().execute(FORGET_NOTES)
+    except sqlite3.OperationalError as error:
+        if "no such table" not in str(error):
+            raise OperationalError(FORGET_NOTES, None, error) from error
         return False
     return True
 

@@ -103,7 +103,8 @@ def _system(settings: Settings) -> Any:
 def log_faults_alone() -> None:
     """Leave out of the engine's log what is no fault, and keep it from adding a handler of its own."""
     engine = logging.getLogger("dbos")
-    engine.addHandler(logging.NullHandler())
+    if not engine.handlers:
+        engine.addHandler(logging.NullHandler())
     engine.addFilter(_fault)
 
 

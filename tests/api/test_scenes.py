@@ -154,7 +154,7 @@ def test_a_plan_takes_the_scene_of_its_policy_and_its_tool_touches(trained: Serv
     assert (
         f"{nearest['link']} is {nearest['least_mm']:.2f} mm from tissue, in pass 0, A1" in playback["headline"]["text"]
     )
-    assert "From tissue and obstacles" in trained.http.get(f"/pages/plans/{made['id']}").text
+    assert "Arms from tissue and obstacles" in trained.http.get(f"/pages/plans/{made['id']}").text
     bag = trained.http.get(f"/plans/{made['id']}/trajectory?handoff=none", headers={"Accept": "application/zip"})
     assert_problem(bag, 409)
 

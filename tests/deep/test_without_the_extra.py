@@ -158,6 +158,6 @@ def test_the_command_line_says_it_too(tmp_path: Path, monkeypatch: pytest.Monkey
         said = CliRunner().invoke(app, ["train", "kestrel", "simple-running", "--setting", "steps=5"])
         assert said.exit_code == 1 and "--learner dqn" in said.stderr
         said = CliRunner().invoke(app, ["train", "kestrel", "simple-running", "--learner", "dqn", "--setting", "steps"])
-        assert said.exit_code == 1 and "name=number" in said.stderr
+        assert said.exit_code == 1 and "name=value" in said.stderr
     finally:
         settings.cache_clear()
