@@ -188,7 +188,7 @@ class Policies(Connection):
             suture: The suture type.
             position_mm: Position of the tip in the frame of the pose style.
             rotation_xyzw: Its orientation, a unit quaternion.
-            phase: The phase of the last answer; default: that of the nearest pose.
+            phase: The phase of the last answer; default: by the version's joining rule.
         """
         body = {"position_mm": position_mm, "rotation_xyzw": rotation_xyzw, "phase": phase}
         return await self._ask(NextPose, "POST", STYLE + "/next", body, surgeon=surgeon, suture=suture)

@@ -60,9 +60,8 @@ def pace_of(stamps_ns: Ints, tip_mm: Floats, factor: float = 1.0) -> MotionPace:
     lasted_s = (stamps_ns[last] - stamps_ns[first]) * (factor / 1e9)
     speed = way_mm / lasted_s
     order = np.argsort(speed)
-    travelled = np.cumsum(
-        np.minimum(way_mm, TIP_MM_S * lasted_s + LATE_MM)[order]
-    )  # so that no jump outweighs the rest
+    possible_mm = np.minimum(way_mm, TIP_MM_S * lasted_s + LATE_MM)  # so that no jump outweighs the rest
+    travelled = np.cumsum(possible_mm[order])
     middle = order[np.searchsorted(travelled, travelled[-1] / 2)]
     step_ns = float(np.median(stamps_ns[first + 1] - stamps_ns[first]))
     return MotionPace(1e9 / (factor * step_ns), float(speed[middle]))

@@ -182,3 +182,5 @@ def test_an_error_that_was_not_judged_is_said_and_not_good():
         assert words in line.text
     line = line_of(FULL, other, UNCALIBRATED, stated_by="request")
     assert (line.level, line.errors) == ("good", "calibrated")
+    line = line_of(FULL, other, UNCALIBRATED, stated_by="request", feasible=False)
+    assert (line.level, line.errors, line.probability) == ("bad", "calibrated", None)

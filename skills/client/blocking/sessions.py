@@ -53,8 +53,8 @@ class Session:
         Args:
             position_mm: Position of the tip in the frame of `opening`.
             rotation_xyzw: Its orientation, a unit quaternion.
-            phase: Another phase than the session's, which is that of its last answer, and at first that of the
-                nearest pose.
+            phase: Another phase than the session's, which is that of its last answer, and at first by the joining rule
+                of the version.
 
         Raises:
             SessionClosed: The service closed the session, the connection was lost, or no answer came in time: stop.

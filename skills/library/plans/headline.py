@@ -51,7 +51,7 @@ def headline(plan: PlanDescription, report: Verdict, *, errors: ArmErrors, lower
         level=level,
         word=word,
         text=f"{word}: {verdict} {describe_motion(plan)}",
-        errors=said.errors or errors.name,
+        errors=report.estimate.under[0].errors.name if report.stated_by == "request" else errors.name,
         probability=said.probability,
         counts=said.counts,
         event=None if said.counts is None else EVENTS[said.counts],
@@ -65,7 +65,6 @@ def headline(plan: PlanDescription, report: Verdict, *, errors: ArmErrors, lower
 class _Estimated(NamedTuple):
     """The probability of a headline, and the sentences on it; of a plan that is not feasible there is none."""
 
-    errors: str | None = None
     probability: Probability | None = None
     counts: CountedEvent | None = None
     estimate: str | None = None
@@ -81,9 +80,9 @@ def _estimated(plan: PlanDescription, report: Verdict, errors: ArmErrors) -> _Es
     except Conflict as unjudged:
         return _Estimated(unjudged=unjudged.words())
     counts, left_out = counted_as(stated), not_judged(plan, stated)
-    whole, name = stated.plan, stated.errors.name
+    whole = stated.plan
     estimate = (
-        f"with {describe_errors(name)} {EVENTS[counts]} in {whole.count} of {whole.of} worlds: "
+        f"with {describe_errors(stated.errors.name)} {EVENTS[counts]} in {whole.count} of {whole.of} worlds: "
         f"{_percent(whole.probability)} ({_percent(whole.lower)} to {_percent(whole.upper)}, 95 %)."
     )
     if left_out != [_NEVER_JUDGED]:
@@ -93,7 +92,7 @@ def _estimated(plan: PlanDescription, report: Verdict, errors: ArmErrors) -> _Es
         f"{min((each.succeeds.lower for each in one.passes), default=0.0):.3f} (95 %)"
         for one in report.estimate.under
     )
-    return _Estimated(name, whole, counts, estimate, under, tuple(left_out), costs_most(report))
+    return _Estimated(whole, counts, estimate, under, tuple(left_out), costs_most(report))
 
 
 def judged_under(report: Verdict, errors: ArmErrors) -> EstimateUnder:
