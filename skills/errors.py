@@ -24,9 +24,10 @@
     ├── TooSlow                 the body of a request did not arrive in time
     ├── Corrupt                 stored data no longer matches its digest
     ├── Busy                    the database or the queue cannot be used now
+    │   ├── DatabaseBusy        the database: locked, overloaded or away; a job waits for it
+    │   │   └── DatabaseUnusable    and why, of which it is a NotReady too: logged, and never sent over HTTP
     │   ├── StorageFull         a disk is full: of the database, or of temporary files
     │   └── NotReady            a part of the installation cannot be used; the message says which
-    │       └── DatabaseUnusable    its database, and why: logged, and never sent over HTTP
     ├── SimulationFailed        the simulator crashed, hung or returned nonsense
     ├── LearningFailed          the learning process crashed, hung or exceeded its limits
     └── Unanswered              a subprocess returned no result; its caller raises an error in words of its own
@@ -150,6 +151,13 @@ class Busy(SkillsError):
     """The database or the queue cannot be used now."""
 
 
+class DatabaseBusy(Busy):
+    """The database is locked, overloaded or away: a job waits for it, at no cost of its attempts."""
+
+
+DatabaseBusy.kind = Busy.kind  # over HTTP there is no difference
+
+
 class StorageFull(Busy):
     """A disk is full, of the database or of temporary files: a retry does not help, free space does."""
 
@@ -158,7 +166,7 @@ class NotReady(Busy):
     """A part of the installation cannot be used: its database, its queue, its workers."""
 
 
-class DatabaseUnusable(NotReady):
+class DatabaseUnusable(NotReady, DatabaseBusy):
     """The database cannot be used; the message names its file or server, so it is logged and never sent over HTTP."""
 
 

@@ -14,6 +14,7 @@ even if several workers train it. The batch ends in the same transaction as its 
 
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict
@@ -25,7 +26,7 @@ from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_event
 from skills.db.session import Database
-from skills.errors import Conflict, NotFound, TooMany
+from skills.errors import Conflict, DatabaseBusy, NotFound, TooMany
 from skills.library.operation import locks
 from skills.library.people.consent import require
 from skills.library.policies.releases import is_served
@@ -250,7 +251,7 @@ def progress_callback(database: Database, request: JobRequest) -> Callable[[floa
     mine = (Job.identity == request.identity, Job.state == "running")
 
     def tell(share: float) -> None:
-        with database.writing(()) as session:
+        with suppress(DatabaseBusy), database.writing(()) as session:  # the next one is stored; the work is not lost
             session.execute(update(Job).where(*mine).values(progress=share), **UNSYNCHRONISED)
 
     return tell
