@@ -38,7 +38,8 @@ line and Python each word in their own terms (`skills.remedies`). Only `skills.a
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from math import isfinite
 from typing import TypeVar
 
 from skills.remedies import Door, Remedy
@@ -85,6 +86,24 @@ E = TypeVar("E", bound=SkillsError)
 
 class BadInput(SkillsError):
     """The input is wrong; nothing was stored."""
+
+
+def refuse_not_finite(value: object, name: Callable[[Sequence[str]], str] = ".".join, path: Sequence[str] = ()) -> None:
+    """Refuse nan and inf, which JSON does not have, in the values of mappings and sequences.
+
+    Args:
+        value: A number, or a mapping or sequence with others in it; anything else passes.
+        name: Names a value in the message by its path.
+        path: The keys and indices that lead to the value.
+
+    Raises:
+        BadInput: There is one; the message names it.
+    """
+    if isinstance(value, float) and not isfinite(value):
+        raise BadInput(f"{name(path)} is {value}; every number must be finite.")
+    named = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list | tuple) else ()
+    for key, part in named:
+        refuse_not_finite(part, name, (*path, str(key)))
 
 
 class AmbiguousDigest(BadInput):

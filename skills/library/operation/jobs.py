@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict
 from sqlalchemy import ColumnElement, ScalarSelect, Select, Table, delete, exists, func, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
@@ -288,6 +288,12 @@ def shown() -> list[ColumnElement[bool]]:
     # A scalar and not `exists`, which PostgreSQL may turn into a join, for which it reads and sorts all jobs.
     of_job = select(erased).where(erased == Job.surgeon_row).correlate(Job).scalar_subquery()
     return [Job.kind != PART, of_job.is_(None)]
+
+
+def requested_again() -> ColumnElement[bool]:
+    """Return a condition on `Job`: there is a later job with the same request."""
+    later = aliased(Job)
+    return exists().where(later.identity == Job.identity, later.row > Job.row).correlate(Job)
 
 
 def newest(session: Session, request: JobRequest) -> Job | None:
