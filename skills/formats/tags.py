@@ -25,7 +25,6 @@ from skills.formats.archive import printable
 TAGS_BYTES = 32 << 20  # per JSON file: the frames of a day of video
 LABELS = 10_000
 
-OTHERS = "left aside: it has no tags of a recorder"
 _WORDS = ("timestamps_ns", "cpu_ts")  # of tags and sidecars alone; other JSON has frames and stages too
 _NAME_LENGTH = 200
 _LATEST_FRAME = 10**12  # larger numbers are nanoseconds; this one is 17 minutes after midnight of 1 January 1970
@@ -48,17 +47,16 @@ def read_labels(texts: Mapping[str, str]) -> tuple[tuple[Label, ...], dict[str, 
     left_aside, documents = dict[str, str](), dict[str, Json]()
     for name, text in texts.items():
         document = _parsed(name, text)
-        if document is None:
-            left_aside[_short(name)] = OTHERS
+        stages = document.get("stages", []) if isinstance(document, dict) else []
+        is_tags = name.endswith("tags.json") or (isinstance(stages, list) and all(map(_is_named, stages)))
+        if document is None or not is_tags:
+            left_aside[_short(name)] = "left aside: it has no tags of a recorder"
         elif isinstance(document, dict):
             documents[name] = document
     frames = dict(_sidecars(documents))
     labels: set[Label] = set()
     for name, document in documents.items():
         stages = document.get("stages", [])
-        if not name.endswith("tags.json") and not (isinstance(stages, list) and all(map(_is_named, stages))):
-            left_aside[_short(name)] = OTHERS
-            continue
         if not isinstance(stages, list) or len(labels) + len(stages) > LABELS:
             raise UnreadableRecording(f"{_short(name)}: `stages` is not a list of at most {LABELS} stages.")
         stamps = _stamps_for(name, document, frames)
@@ -82,9 +80,7 @@ def _parsed(name: str, text: str) -> Any:
     except (ValueError, RecursionError) as error:
         if not name.endswith("tags.json") and not any(f'"{word}"' in text for word in _WORDS):
             return None
-        raise UnreadableRecording(
-            f"{_short(name)} is not valid JSON ({type(error).__name__}); write it again."
-        ) from error
+        raise UnreadableRecording(f"{_short(name)} is not valid JSON ({type(error).__name__}); mend it.") from error
 
 
 def _sidecars(documents: Mapping[str, Json]) -> Iterator[tuple[str, list[Any]]]:

@@ -179,9 +179,9 @@ def test_a_try_that_releases_nothing_says_which_version_is_served(database: Data
     recording = stored(database)
     assert steps(tried(database, recording, **ANSWERS))[-1]["text"] == "Version 1 is served now."
     again = steps(tried(database, recording, **ANSWERS | {"release": False}))[-1]["text"]
-    assert again == "Version 1 is served already, and not released again: that was not requested."
+    assert again == "Version 1 is not released by this: that was not requested. Version 1 is served."
     other = steps(tried(database, recording, **ANSWERS | {"release": False, "cell_mm": 4.0}))[-1]["text"]
-    assert other == "Version 2 is not released: that was not requested. Version 1 is still served."
+    assert other == "Version 2 is not released by this: that was not requested. Version 1 is served."
 
 
 def test_a_try_is_repeated_after_it_ended_and_not_before(database: Database) -> None:

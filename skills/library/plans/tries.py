@@ -409,24 +409,20 @@ def _release(
     feasible: bool,
 ) -> TryStep:
     """Release a version if that is wanted, it passes the gate, and its plan is feasible; a refusal ends no try."""
-    number = version.version
     with database.reading() as session:
         served = releases.served(session, version.surgeon, version.suture)
-        now = None if served is None else served.policy.version
-    still = "" if now in (None, number) else f" Version {now} is still served."
+        now = "" if served is None else f" Version {served.policy.version} is served."
     if not (wanted and passes and feasible):
         plan = "its plan is not feasible; release it by its number if it is to be served all the same"
         why = "it does not pass the gate" if not passes else "that was not requested" if not wanted else plan
-        said = "is served already, and not released again" if now == number else "is not released"
-        return _done("release", f"Version {number} {said}: {why}.{still}")
+        return _done("release", f"Version {version.version} is not released by this: {why}.{now}")
     try:
         with database.writing([locks.surgeon(version.surgeon.slug)]) as session:
             stored = session.get_one(PolicyVersion, version.row)
             releases.release(session, stored, actor, constant_turn_deg=settings.constant_turn_deg)
     except Conflict as refused:
-        step = _refused("release", refused, ())
-        return step.model_copy(update={"text": step.text + still})
-    return _done("release", f"Version {number} is served now.", version.sha256)
+        return _refused("release", refused, ()).model_copy(update={"text": refused.message + now})
+    return _done("release", f"Version {version.version} is served now.", version.sha256)
 
 
 def _plan(database: Database, asked: TryIn, version: PolicyVersion, actor: str) -> tuple[str, str]:
