@@ -281,6 +281,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
             print(f"The page: {scheme}://{settings.host}:{settings.port}{settings.root_path}/", flush=True)
         if samples:
             threading.Thread(target=_load, args=(settings, app.state.access.own_key), daemon=True).start()
+        app.state.reader.server.start()
         warm_up(align_once)
         layers_held()  # logs a warning if some are missing
 
