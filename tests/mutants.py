@@ -379,7 +379,7 @@ GUARDS = (
         "skills/library/policies/gate.py", 14,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_scenes.py",
          "tests/api/test_policies.py::test_a_demo_in_a_frame_other_than_the_arms_base_is_not_released",
-         "tests/library/test_hands.py"),
+         "tests/library/test_hands.py", "tests/learning/test_pose_step.py"),
     ),
     Guard("skills/library/policies/fit.py", 4, ("tests/library/test_fair_batches.py",)),
     Guard(

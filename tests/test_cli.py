@@ -21,6 +21,8 @@ from skills.formats.bag_writer import write_mcap
 from skills.formats.lerobot.cut import find_dataset
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.gridworld.scene import Scene
+from skills.jobs import Engine
+from skills.jobs.in_process import InProcess
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
 from skills.simulation import film
@@ -32,7 +34,9 @@ from tests.library.test_pose_styles import both_arms
 STYLE = ("wren", "simple-running")
 
 
-def test_a_command_that_waits_for_one_job_starts_one_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_start_for_batches_and_a_single_job_runs_in_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     crews: list[int] = []
 
     @contextmanager
@@ -41,11 +45,16 @@ def test_a_command_that_waits_for_one_job_starts_one_worker(tmp_path: Path, monk
         yield
 
     monkeypatch.setattr("skills.serving.working", working)
+    alone: list[Settings] = []
+    monkeypatch.setattr(
+        InProcess, "__init__", lambda self, given: (alone.append(given), Engine.__init__(self, given))[1]
+    )
     of_four = Settings(database_url=f"sqlite:///{tmp_path / 'skills.sqlite'}", workers=4)
     for given, workers in ((of_four, 0), (of_four, 1), (of_four, MANY), (of_four.model_copy(update={"workers": 0}), 1)):
         with connect(given, workers=workers):
             pass
-    assert crews == [1, 4, 0]
+    assert crews == [4]
+    assert alone == [of_four]  # SKILLS_WORKERS=0 says that workers run elsewhere
 
 
 def test_a_dataset_is_exported_verified_and_never_overwritten(skills, tmp_path: Path) -> None:

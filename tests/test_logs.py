@@ -19,8 +19,8 @@ from skills.db.session import Database
 from skills.demo import wait_until_ready
 from skills.errors import BadInput
 from skills.jobs import log_faults_alone
+from skills.jobs.attempts import Work
 from skills.jobs.worker import logged
-from skills.jobs.workflows import Work
 from skills.settings import Settings
 from tests import backends
 from tests.api.service import CSV, Service, serving

@@ -47,12 +47,13 @@ DESCRIPTION = (
 NO_TELEMETRY = TelemetryConfig(tracing=False, metrics=False, logs=False, operation_spans=False, auto_configure=False)
 
 
-def create_app(settings: Settings, *, by_path: bool = False) -> FastAPI:
+def create_app(settings: Settings, *, by_path: bool = False, engine: type[Engine] = Engine) -> FastAPI:
     """Create the application. Its start-up migrates the database and seeds the catalogue.
 
     Args:
         settings: Those of the installation.
         by_path: Import routes at the first request of their path, for an application that answers one command.
+        engine: What is told of jobs.
 
     Raises:
         BadSettings: The installation states impossible errors of its arms.
@@ -85,7 +86,7 @@ def create_app(settings: Settings, *, by_path: bool = False) -> FastAPI:
     )
     app.state.settings, app.state.by_path = settings, by_path
     app.state.database = Database.of(settings)
-    app.state.engine = Engine(settings)
+    app.state.engine = engine(settings)
     app.state.encoded = Encoded()
     app.state.served = PolicyCache(app.state.database, app.state.encoded)
     app.state.watching = Watching(app.state.database, app.state.served.changes, settings)

@@ -29,8 +29,8 @@ def service(*, workers: int = 0) -> Iterator["Client"]:
 def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
     """Connect to the service at SKILLS_SERVER, or else to the application in this process.
 
-    In-process, jobs need a worker. While the connection is open as many run as the settings say, but not more than
-    `workers`: a further one does nothing for a single job, and takes processor time from the first.
+    In-process, a single job is performed in a thread (`InProcess`). For the parts of a batch as many workers as the
+    settings say, but not more than `workers`, run while the connection is open.
     """
     from skills.client import Client
 
@@ -42,8 +42,11 @@ def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
     from starlette.testclient import TestClient
 
     from skills.api.app import create_app
+    from skills.jobs import Engine
+    from skills.jobs.in_process import InProcess
 
-    app = create_app(settings, by_path=True)
+    alone = workers == 1 <= settings.workers
+    app = create_app(settings, by_path=True, engine=InProcess if alone else Engine)
     # no check of a key is needed: the caller has access to the database anyway
     key = {"X-API-Key": app.state.access.own_key}
     in_process = TestClient(app, base_url="http://localhost", headers=key)
@@ -58,7 +61,7 @@ def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
 
 
 def _crew(settings: "Settings", workers: int) -> AbstractContextManager[None]:
-    if not workers:
+    if workers < 2:
         return nullcontext()
     from skills.serving import working
 

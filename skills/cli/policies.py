@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import time
 from dataclasses import fields, replace
 from math import degrees, nan
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from skills.schemas.training import RetrainedStyle, Retraining
 
 WATCH_S = 0.3
+WORD = re.compile(r"(?!(true|false|null)$)[a-z][a-z-]*")
 
 commands = typer.Typer()
 policies = typer.Typer(no_args_is_help=True, help="Learnt policies.")
@@ -144,8 +146,8 @@ def _settings(option: str, settings: list[str]) -> dict[str, object]:
     for setting in settings:
         name, _, value = setting.partition("=")
         try:
-            # as JSON, so that numbers, lists and booleans have their type
-            found[name] = json.loads(value)
+            # as JSON, so that numbers, lists and booleans have their type; a word needs no quotation marks
+            found[name] = value if WORD.fullmatch(value) else json.loads(value)
         except ValueError:
             example = "steps=100000" if option == "--setting" else "touch=100"
             raise BadInput(f"{setting!r} is not a setting.", f"Write it as name=value, such as {example}") from None

@@ -3,7 +3,9 @@
 The engine stores its workflows in SQLite or PostgreSQL. The row of a job in our database is authoritative; the engine
 only makes sure that a worker processes it.
 
-    workflows   the workflow of one job: try, retry, give up; and the engine of a worker, which runs it
+    attempts    one attempt at a job: try, pause, retry, give up
+    in_process  performs jobs in the process of one command, without the engine
+    workflows   the workflow of one job, and the engine of a worker, which runs it
     watch       a worker's periodic tasks: leases and heartbeats, enqueueing, taking over from dead workers, outcomes
     readiness   checks of the database, the engine and the workers, for health checks
     warm_up     compiles or loads the compiled loops before they are needed

@@ -45,7 +45,9 @@ def refuse_unready(settings: Settings) -> int:
         _try_database(database)
         database.compare_history()
         _try_engine(settings)
-        return _workers(database, settings.lease_s)
+        if not (alive := live_workers(database, settings.lease_s)):
+            raise NotReady("No worker has renewed its lease.", Remedy(Action.START_WORKER))
+        return alive
 
 
 def _refuse_missing(url: str, what: str) -> None:
@@ -80,7 +82,7 @@ def _try_engine(settings: Settings) -> None:
         raise NotReady("The job engine's database cannot be used; check it, and start a worker.") from error
 
 
-def _workers(database: Database, lease_s: float) -> int:
+def live_workers(database: Database, lease_s: float) -> int:
     """Return the number of live workers, by the dates of their heartbeats or, if all are old, by waiting for a new one.
 
     A clock that was adjusted, or that of another machine, makes a live worker look dead; a heartbeat that changes shows
@@ -92,8 +94,6 @@ def _workers(database: Database, lease_s: float) -> int:
     while first and not alive and time.monotonic() < until:
         time.sleep(LOOK_S)
         alive = sum(first.get(name) != beat_at for name, beat_at in _beats(database).items())
-    if not alive:
-        raise NotReady("No worker has renewed its lease.", Remedy(Action.START_WORKER))
     return alive
 
 

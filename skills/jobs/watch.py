@@ -20,7 +20,7 @@ from skills.db import now
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.jobs import JOBS, QUEUES, STEPS, cancel, submit, workflow_id
-from skills.jobs.workflows import fail
+from skills.jobs.attempts import fail
 from skills.library.operation import locks
 from skills.library.operation.history import NAMED, Verified, sign_some_history, verify_history
 from skills.library.operation.jobs import ACTIVE, BATCH, UNSYNCHRONISED

@@ -28,8 +28,9 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import SkillsError
 from skills.jobs import BATCHES, JOBS, connect
+from skills.jobs.attempts import Perform, Work
 from skills.jobs.watch import Leases, Watch
-from skills.jobs.workflows import Perform, Work, engine_of, recover_workflows
+from skills.jobs.workflows import engine_of, recover_workflows
 from skills.library.operation.sweep import SteadyClock, sweep
 from skills.logs import job_id, log_fields
 from skills.sandbox.forked import refuse_uncontained

@@ -27,7 +27,7 @@ WORKER = """
 import json, sys, time
 from pathlib import Path
 from skills.db.session import Database
-from skills.jobs.workflows import Work
+from skills.jobs.attempts import Work
 from skills.library.perform import perform_job
 from skills.settings import Settings
 

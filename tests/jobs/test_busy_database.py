@@ -9,10 +9,10 @@ import pytest
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import BadInput, Busy, DatabaseBusy, DatabaseUnusable
-from skills.jobs import watch, workflows
+from skills.jobs import attempts, watch
+from skills.jobs.attempts import Work
 from skills.jobs.watch import Leases, Watch
 from skills.jobs.worker import _go_round
-from skills.jobs.workflows import Work
 from skills.library.operation import jobs
 from skills.library.plans import tries
 from skills.library.plans.tries import try_recording
@@ -54,7 +54,7 @@ class Installation:
         with database.writing() as session:
             session.get_one(Job, row).state = "succeeded"
 
-    def try_once(self, perform: workflows.Perform | None = None) -> bool:
+    def try_once(self, perform: attempts.Perform | None = None) -> bool:
         return Work(self.impatient, self.settings, perform or self.perform).try_once(self.row, 1, 0)
 
     def job(self) -> Job:
@@ -65,7 +65,7 @@ class Installation:
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Installation]:
     place = Installation(tmp_path / "skills.sqlite")
-    monkeypatch.setattr(workflows.time, "sleep", lambda seconds: place.pause(seconds) if seconds else None)
+    monkeypatch.setattr(attempts.time, "sleep", lambda seconds: place.pause(seconds) if seconds else None)
     yield place
     place.other.close()
     place.impatient.close()

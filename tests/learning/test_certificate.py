@@ -239,7 +239,9 @@ def test_the_advised_gamma_is_the_least_that_keeps_the_furthest_value():
         gamma = least_gamma(replace(policy, learner=ValueIteration(slip=slip)))
         kept, faint = (policy.levels.visited * (one * (1 - slip)) ** 448 for one in (gamma, gamma - 0.01))
         assert kept >= FAINT > faint
-    assert least_gamma(replace(policy, learner=ValueIteration(slip=0.9))) is None
+    alone_at_1 = 1 - (1.05 * FAINT / policy.levels.visited) ** (1 / 448)  # and a gamma of 1 discounts nothing
+    for slip in (0.9, alone_at_1):
+        assert least_gamma(replace(policy, learner=ValueIteration(slip=slip))) is None
     alone = GridWorld((0.0, 0.0, 0.0), 1.0, (2, 1, 1))  # every cell is on the path
     beside = learn_tabular(sparse_reward(GridPath(alone, np.arange(2))), PhaseQLearning())
     assert least_gamma(beside) == 0.01

@@ -17,7 +17,7 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.demonstration.recording import Motion, Recording
 from skills.formats import write_mcap
-from skills.jobs.workflows import Work
+from skills.jobs.attempts import Work
 from skills.learning.policy import describe_learner
 from skills.learning.q_learning import CellQLearning
 from skills.library.operation.inspection import inspect_installation

@@ -9,7 +9,7 @@ from sqlalchemy import func, select
 
 from skills.db.service_tables import Event, Job
 from skills.db.session import Database
-from skills.jobs.workflows import Work, fail, start
+from skills.jobs.attempts import Work, fail, start
 from skills.library.people.surgeons import put_surgeon
 from skills.library.perform import perform_job
 from skills.library.policies import batches, retraining

@@ -13,7 +13,7 @@ from skills.db.session import Database
 from skills.demonstration.recording import Motion, Recording
 from skills.errors import BadPlan, Conflict
 from skills.formats import write_mcap
-from skills.jobs.workflows import Work
+from skills.jobs.attempts import Work
 from skills.kinematics import POINTING_DOWN, angle_between, matrix_of, quaternion_of
 from skills.library.operation.integrity import planned
 from skills.library.perform import perform_job

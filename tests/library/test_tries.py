@@ -19,7 +19,7 @@ from skills.demonstration.recording import Motion, Recording
 from skills.errors import BadSettings, Conflict, NotFound
 from skills.formats import read_recording, write_mcap
 from skills.gridworld.grid import GridWorld, choose_grid
-from skills.jobs.workflows import Work
+from skills.jobs.attempts import Work
 from skills.library.operation import jobs
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon

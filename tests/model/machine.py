@@ -29,7 +29,7 @@ from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback
 from skills.db.service_tables import Job as JobRow
 from skills.db.session import Database
 from skills.errors import NotFound, SkillsError
-from skills.jobs.workflows import Work
+from skills.jobs.attempts import Work
 from skills.library.comparison.atlas import atlas_of
 from skills.library.operation.backup import accept_rollback, back_up, restore
 from skills.library.operation.erasure_list import keep_erasures, read_erasures
