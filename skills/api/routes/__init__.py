@@ -34,8 +34,9 @@ ROUTERS = (
 
 
 def routes_of(part: str | None = None) -> list[BaseRoute]:
-    """Return the routes of the routers with paths that begin with a part; with None, all routes."""
-    wanted = [(f"{__name__}.{module}", name) for module, name, parts in ROUTERS if part is None or part in parts]
+    """Return the routes of the routers with paths that begin with a part; with None or for the document, all routes."""
+    every = part in (None, "openapi.json")
+    wanted = [(f"{__name__}.{module}", name) for module, name, parts in ROUTERS if every or part in parts]
     for module, _ in wanted:  # before their routes are taken, because some add routes to another one's router
         import_module(module)
     routers = [getattr(import_module(module), name) for module, name in wanted]
