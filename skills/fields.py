@@ -8,10 +8,8 @@ import re
 from base64 import b64decode, b64encode
 from functools import cache
 from inspect import cleandoc
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -37,8 +35,18 @@ Six = Annotated[tuple[float, ...], Field(min_length=6, max_length=6)]
 # NaN where it could not be measured, which is null in JSON.
 Figure = float | None
 
+if TYPE_CHECKING:
+    from numpy import float32
+    from numpy.typing import NDArray
 
-def _column(given: Any) -> NDArray[np.float32]:
+    Numbers = NDArray[float32]
+else:
+    Numbers = Any  # numpy is imported at the first use: few answers have columns
+
+
+def _column(given: Any) -> Numbers:
+    import numpy as np
+
     if isinstance(given, str):
         return np.frombuffer(b64decode(given, validate=True), "<f4").astype(np.float32)
     return np.asarray(given, np.float32)
@@ -46,9 +54,9 @@ def _column(given: Any) -> NDArray[np.float32]:
 
 # Many numbers in one field of JSON, a sixth of the bytes and of the time of a list of them. NaN where there is none.
 Column = Annotated[
-    NDArray[np.float32],
+    Numbers,
     PlainValidator(_column),
-    PlainSerializer(lambda column: b64encode(np.ascontiguousarray(column, "<f4").tobytes()).decode()),
+    PlainSerializer(lambda column: b64encode(column.astype("<f4").tobytes()).decode()),
     WithJsonSchema({"type": "string", "contentEncoding": "base64", "contentMediaType": "application/octet-stream"}),
 ]
 

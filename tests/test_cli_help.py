@@ -88,6 +88,41 @@ def test_help_is_quick_because_nothing_heavy_is_imported_for_it(words: list[str]
     assert "pydantic" not in loaded or words != ["--help"]
 
 
+AT_FIRST_USE = {
+    "numba",
+    "scipy",
+    "pyarrow",
+    "matplotlib",
+    "dbos",
+    "rosbags",
+    "pybullet",
+    "uvicorn",
+    "movement_primitives",
+}
+COMPUTING = AT_FIRST_USE | {"numpy", "sqlalchemy", "fastapi", "starlette", "mcap", "alembic", "jinja2"}
+
+
+# The numbers of modules are ours: a twentieth above those of the day when this was written.
+@pytest.mark.parametrize(
+    ("server", "unused", "most"),
+    [("http://127.0.0.1:9", COMPUTING, 590), ("", AT_FIRST_USE, 1350)],
+    ids=["http", "database"],
+)
+def test_a_list_imports_what_it_shows_and_nothing_that_computes(
+    server: str, unused: set[str], most: int, skills, tmp_path: Path
+) -> None:
+    skills.does("surgeon", "put", "kestrel")  # makes the database
+    script = "import sys; from skills.cli import app\ntry: app()\nfinally: print(*sys.modules, file=sys.stderr)"
+    given = {"SKILLS_SERVER": server} if server else {"SKILLS_DATABASE_URL": f"sqlite:///{tmp_path}/skills.sqlite"}
+    ended = subprocess.run(
+        [sys.executable, "-c", script, "surgeon", "list"], env=os.environ | given, capture_output=True, text=True
+    )
+    assert ("gave no answer" in ended.stderr) if server else ("kestrel" in ended.stdout), ended.stderr
+    loaded = ended.stderr.split()
+    assert {one.partition(".")[0] for one in loaded} & unused == set()
+    assert len(loaded) <= most
+
+
 def completed(line: str, **settings: str) -> tuple[list[str], str]:
     """Press Tab at the end of a line, in bash; return the proposals, and all other output."""
     words = line.split(" ")

@@ -7,7 +7,7 @@ from math import inf
 from weakref import WeakValueDictionary
 
 from anyio import CapacityLimiter, to_thread
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
 from fastapi.telemetry import TelemetryConfig
 from starlette.datastructures import MutableHeaders
 from starlette.middleware.errors import ServerErrorMiddleware
@@ -22,24 +22,7 @@ from skills.api.metrics import Observed, ServiceMetrics
 from skills.api.openapi import Json, complete
 from skills.api.policy_cache import CachedPolicyMiddleware, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
-from skills.api.routes import (
-    cards,
-    comparison,
-    datasets,
-    demos,
-    jobs,
-    operating,
-    pages,
-    people,
-    plans,
-    playbacks,
-    policies,
-    recordings,
-    sign_in,
-    timelines,
-    training,
-    tries,
-)
+from skills.api.routes import routes_of
 from skills.api.sessions import Sessions
 from skills.api.streams import DOWNLOADS_READ
 from skills.db.session import Database
@@ -64,8 +47,12 @@ DESCRIPTION = (
 NO_TELEMETRY = TelemetryConfig(tracing=False, metrics=False, logs=False, operation_spans=False, auto_configure=False)
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings, *, by_path: bool = False) -> FastAPI:
     """Create the application. Its start-up migrates the database and seeds the catalogue.
+
+    Args:
+        settings: Those of the installation.
+        by_path: Import routes at the first request of their path, for an application that answers one command.
 
     Raises:
         BadSettings: The installation states impossible errors of its arms.
@@ -96,7 +83,7 @@ def create_app(settings: Settings) -> FastAPI:
         redoc_url=None,
         max_body_size=settings.max_upload_bytes,
     )
-    app.state.settings = settings
+    app.state.settings, app.state.by_path = settings, by_path
     app.state.database = Database.of(settings)
     app.state.engine = Engine(settings)
     app.state.encoded = Encoded()
@@ -108,31 +95,9 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.equal_uploads = WeakValueDictionary()  # of this moment, by route and digest
     app.state.downloads = CapacityLimiter(DOWNLOADS_READ)
     app.state.access = Access(app.state.database, settings)
-    # `include_router` would analyse every route again, at the first request of each application: 90 ms.
-    for router in (  # the order of the calls in the OpenAPI document
-        people.router,
-        recordings.uploads,
-        recordings.router,
-        demos.router,
-        training.router,
-        tries.router,
-        jobs.router,
-        policies.router,
-        plans.router,
-        playbacks.router,
-        plans.suture_point_router,
-        timelines.router,
-        cards.router,
-        datasets.router,
-        comparison.atlas_router,
-        comparison.score_router,
-        operating.router,
-        operating.reference_router,
-        pages.router,
-        sign_in.sign_in_router,
-        people.key_router,
-    ):
-        app.router.routes.extend(router.routes)
+    if not by_path:
+        # `include_router` would analyse every route again, at the first request of each application: 90 ms.
+        app.router.routes.extend(routes_of())
     answer_refusals(app)
     return app
 
@@ -179,8 +144,13 @@ class Service(FastAPI):
         state = self.state
         failing = super().build_middleware_stack()
         assert isinstance(failing, ServerErrorMiddleware)  # the handler of status 500 is outermost, and stays so
-        cached = CachedPolicyMiddleware(failing.app, state.served, policies.get_policy, policies.router)
-        failing.app = Gate(cached, state.access, state.settings, state.database.history)
+        if state.by_path:
+            inner: ASGIApp = RoutesByPath(failing.app, self.router)
+        else:
+            from skills.api.routes import policies
+
+            inner = CachedPolicyMiddleware(failing.app, state.served, policies.get_policy, policies.router)
+        failing.app = Gate(inner, state.access, state.settings, state.database.history)
         return Observed(Headers(HeadAsGet(failing)), state.metrics)
 
 
@@ -194,6 +164,21 @@ ALWAYS = [
     (b"cross-origin-resource-policy", b"same-origin"),  # no other site's page can embed our pictures
     (b"permissions-policy", b"camera=(), geolocation=(), microphone=(), payment=(), usb=()"),
 ]
+
+
+class RoutesByPath:
+    """ASGI middleware that adds the routes of a path at its first request, so that one command imports few of them."""
+
+    def __init__(self, app: ASGIApp, router: APIRouter) -> None:
+        self.app = app
+        self._router = router
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Add the routes of the request's path, and pass it on."""
+        if scope["type"] == "http":
+            routes = self._router.routes
+            routes.extend([one for one in routes_of(scope["path"].split("/")[1]) if one not in routes])
+        await self.app(scope, receive, send)
 
 
 class HeadAsGet:

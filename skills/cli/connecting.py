@@ -1,7 +1,7 @@
 """The connection of a command to the service, or to the application in its own process, and waiting for jobs there."""
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from skills.cli.output import job_status
@@ -42,20 +42,27 @@ def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
     from starlette.testclient import TestClient
 
     from skills.api.app import create_app
-    from skills.library.operation.erasure_list import keep_up_erasures
-    from skills.serving import working
 
-    app = create_app(settings)
+    app = create_app(settings, by_path=True)
     # no check of a key is needed: the caller has access to the database anyway
     key = {"X-API-Key": app.state.access.own_key}
     in_process = TestClient(app, base_url="http://localhost", headers=key)
-    crew = settings.model_copy(update={"workers": min(workers, settings.workers)})
-    with in_process as http, working(crew) if workers else nullcontext():
+    with in_process as http, _crew(settings, workers):
         try:
             yield Client(http)
         finally:
             if settings.erasures_file is not None:
+                from skills.library.operation.erasure_list import keep_up_erasures
+
                 keep_up_erasures(app.state.database, settings.erasures_file)
+
+
+def _crew(settings: "Settings", workers: int) -> AbstractContextManager[None]:
+    if not workers:
+        return nullcontext()
+    from skills.serving import working
+
+    return working(settings.model_copy(update={"workers": min(workers, settings.workers)}))
 
 
 @contextmanager

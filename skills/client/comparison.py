@@ -1,11 +1,16 @@
 """Calls of atlases, recognition and scores."""
 
-from typing import Unpack
+from __future__ import annotations
 
+from typing import TYPE_CHECKING, Unpack
+
+from skills import schemas
 from skills.client.connection import Connection
 from skills.keywords import ScoreKeywords
-from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
-from skills.schemas.scores import Progress, Score
+
+if TYPE_CHECKING:
+    from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
+    from skills.schemas.scores import Progress, Score
 
 
 class Comparisons(Connection):
@@ -23,7 +28,12 @@ class Comparisons(Connection):
             demo: Digest of a demonstration in the atlas; the atlas then says whose style it resembles.
         """
         return await self._get(
-            Atlas, "/styles/{suture}/atlas", suture=suture, scaled=scaled, clusters=clusters, demo=demo
+            schemas.comparison.Atlas,
+            "/styles/{suture}/atlas",
+            suture=suture,
+            scaled=scaled,
+            clusters=clusters,
+            demo=demo,
         )
 
     async def nearest(self, demo: str, *, count: int = 10, scaled: bool = False) -> Nearest:
@@ -34,7 +44,9 @@ class Comparisons(Connection):
             count: Number of neighbours, at most 100.
             scaled: Normalise size too; distances are then in units of the distance from start to goal.
         """
-        return await self._get(Nearest, "/demos/{demo}/nearest", demo=demo, count=count, scaled=scaled)
+        return await self._get(
+            schemas.comparison.Nearest, "/demos/{demo}/nearest", demo=demo, count=count, scaled=scaled
+        )
 
     async def recognise(self, recording: str, suture: str) -> RecognisedRecording:
         """Recognise the surgeon of a whole recording by all its movements, with its session left out.
@@ -44,7 +56,7 @@ class Comparisons(Connection):
             suture: The suture type.
         """
         path = "/styles/{suture}/recognition"
-        return await self._get(RecognisedRecording, path, suture=suture, recording=recording)
+        return await self._get(schemas.comparison.RecognisedRecording, path, suture=suture, recording=recording)
 
     async def score(self, surgeon: str, suture: str, **options: Unpack[ScoreKeywords]) -> Score:
         """Score a demonstration, or a part of a recording, against a style; nothing is stored. Not a credential.
@@ -54,7 +66,9 @@ class Comparisons(Connection):
             suture: The suture type.
             **options: Either `demo`, or `recording` and the part of it; the reference, and the task of the rating.
         """
-        return await self._ask(Score, "POST", "/scores", {"surgeon": surgeon, "suture": suture, **options})
+        return await self._ask(
+            schemas.scores.Score, "POST", "/scores", {"surgeon": surgeon, "suture": suture, **options}
+        )
 
     async def progress(self, surgeon: str, suture: str, *, against: str) -> Progress:
         """Compare a surgeon's demonstrations with a style's reference, session by session. Not a credential.
@@ -65,4 +79,4 @@ class Comparisons(Connection):
             against: The surgeon whose style is the reference.
         """
         path = "/surgeons/{surgeon}/progress"
-        return await self._get(Progress, path, surgeon=surgeon, suture=suture, against=against)
+        return await self._get(schemas.scores.Progress, path, surgeon=surgeon, suture=suture, against=against)

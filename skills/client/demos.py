@@ -1,13 +1,18 @@
 """Calls of demonstrations."""
 
-from pathlib import Path
-from typing import Unpack
+from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Unpack
+
+from skills import schemas
 from skills.client.connection import Connection
 from skills.client.files import Progress
 from skills.keywords import DemoKeywords, DemoUploadKeywords
 from skills.schemas import DemoOutcome, OutcomeAsked
-from skills.schemas.demos import Demonstration, DemoPath, RewardMap
+
+if TYPE_CHECKING:
+    from skills.schemas.demos import Demonstration, DemoPath, RewardMap
 
 
 class Demos(Connection):
@@ -22,7 +27,7 @@ class Demos(Connection):
         **options: Unpack[DemoUploadKeywords],
     ) -> Demonstration:
         """Store a recording and one demonstration of it; see `add_recording` and `cut_demo`."""
-        return await self._upload(Demonstration, "/demos", recording, media_type, progress, **options)
+        return await self._upload(schemas.demos.Demonstration, "/demos", recording, media_type, progress, **options)
 
     async def cut_demo(self, recording: str, **options: Unpack[DemoKeywords]) -> Demonstration:
         """Cut a demonstration out of a stored recording.
@@ -35,7 +40,9 @@ class Demos(Connection):
             Problem: Of kind "segment-not-named" if several hand-offs are proposed and none was named; its `numbers`
                 list them, as `skills.schemas.results.ProposedSegments` reads them.
         """
-        return await self._ask(Demonstration, "POST", "/recordings/{recording}/demos", options, recording=recording)
+        return await self._ask(
+            schemas.demos.Demonstration, "POST", "/recordings/{recording}/demos", options, recording=recording
+        )
 
     async def demos(
         self,
@@ -51,16 +58,22 @@ class Demos(Connection):
         `active` true leaves out withdrawn ones, false all others; `outcome` all that are not marked so.
         """
         return await self._all(
-            Demonstration, "/demos", surgeon=surgeon, suture=suture, recording=recording, active=active, outcome=outcome
+            schemas.demos.Demonstration,
+            "/demos",
+            surgeon=surgeon,
+            suture=suture,
+            recording=recording,
+            active=active,
+            outcome=outcome,
         )
 
     async def demo(self, demo: str) -> Demonstration:
         """Return a demonstration."""
-        return await self._get(Demonstration, "/demos/{demo}", demo=demo)
+        return await self._get(schemas.demos.Demonstration, "/demos/{demo}", demo=demo)
 
     async def demo_report(self, demo: str) -> Demonstration:
         """Return a demonstration with its report, measured anew."""
-        return await self._get(Demonstration, "/demos/{demo}/report", demo=demo)
+        return await self._get(schemas.demos.Demonstration, "/demos/{demo}/report", demo=demo)
 
     async def demo_report_page(self, demo: str) -> bytes:
         """Return a demonstration's report as a standalone HTML page."""
@@ -68,11 +81,11 @@ class Demos(Connection):
 
     async def demo_path(self, demo: str) -> DemoPath:
         """Return a demonstration's states, and its motion as recorded."""
-        return await self._get(DemoPath, "/demos/{demo}/path", demo=demo)
+        return await self._get(schemas.demos.DemoPath, "/demos/{demo}/path", demo=demo)
 
     async def reward_map(self, demo: str) -> RewardMap:
         """Return the rewards of Algorithm 1 along a demonstration."""
-        return await self._get(RewardMap, "/demos/{demo}/reward-map", demo=demo)
+        return await self._get(schemas.demos.RewardMap, "/demos/{demo}/reward-map", demo=demo)
 
     async def demo_recording(self, demo: str) -> bytes:
         """Return the recording's bytes; use `save_recording` for a large one, which is not held in memory."""
@@ -84,7 +97,7 @@ class Demos(Connection):
         Raises:
             Corrupt: The download is not the recording; no file is written.
         """
-        about = await self._get(Demonstration, "/demos/{demo}", demo=demo)
+        about = await self._get(schemas.demos.Demonstration, "/demos/{demo}", demo=demo)
         return await self._save("/demos/{demo}/recording", to, progress, sha256=about.recording, demo=demo)
 
     async def mark_demo(self, demo: str, outcome: DemoOutcome, *, reason: str | None = None) -> Demonstration:
@@ -95,7 +108,9 @@ class Demos(Connection):
         because somebody may have marked it otherwise meanwhile.
         """
         body = {"outcome": outcome, "reason": reason}
-        return await self._ask(Demonstration, "PUT", "/demos/{demo}/outcome", body, idempotent=False, demo=demo)
+        return await self._ask(
+            schemas.demos.Demonstration, "PUT", "/demos/{demo}/outcome", body, idempotent=False, demo=demo
+        )
 
     async def withdraw_demo(self, demo: str, *, erase: bool = False) -> None:
         """Withdraw a demonstration and the releases that rest on it, or erase it and everything derived from it."""

@@ -1,17 +1,22 @@
 """Calls of jobs, keys, the readiness check and the signed history."""
 
+from __future__ import annotations
+
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing, suppress
 from datetime import datetime
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import httpx2 as httpx
 
+from skills import schemas
 from skills.client.connection import Connection, parse_text
 from skills.client.problems import JobFailed, JobTakesLonger, NotReached, NotUnderstood, Problem
-from skills.schemas.operation import Job
-from skills.schemas.people import Key, NewKey
-from skills.schemas.responses import Ready, ServedAt, SignedCheckpoint
+
+if TYPE_CHECKING:
+    from skills.schemas.operation import Job
+    from skills.schemas.people import Key, NewKey
+    from skills.schemas.responses import Ready, ServedAt, SignedCheckpoint
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 Kind = Literal["training", "retraining", "playback", "pictures", "dataset", "try"]
@@ -26,18 +31,21 @@ class Operation(Connection):
 
     async def job(self, job: str) -> Job:
         """Return a job."""
-        return await self._get(Job, "/jobs/{job}", job=job)
+        return await self._get(schemas.operation.Job, "/jobs/{job}", job=job)
 
     async def jobs(self, state: State | None = None, kind: Kind | None = None) -> list[Job]:
         """List jobs, the newest first."""
-        return await self._all(Job, "/jobs", state=state, kind=kind)
+        return await self._all(schemas.operation.Job, "/jobs", state=state, kind=kind)
 
     async def cancel(self, job: str) -> Job:
         """Cancel a job."""
-        return await self._ask(Job, "DELETE", "/jobs/{job}", job=job)
+        return await self._ask(schemas.operation.Job, "DELETE", "/jobs/{job}", job=job)
 
     async def wait(
-        self, job: Job | str, timeout_s: float = 600.0, progress: Callable[[Job], None] | None = None
+        self,
+        job: Job | str,
+        timeout_s: float = 600.0,
+        progress: Callable[[Job], None] | None = None,
     ) -> Job:
         """Wait until a job has ended, and return it.
 
@@ -97,13 +105,13 @@ class Operation(Connection):
                 return
             async for line in answer.aiter_lines():
                 if line.startswith("data:"):  # the service writes each event's data on one line
-                    yield parse_text(Job, line.removeprefix("data:"))
+                    yield parse_text(schemas.operation.Job, line.removeprefix("data:"))
                 if self._clock() >= over_s:  # heartbeats may continue for ever
                     return
 
     async def keys(self) -> list[Key]:
         """List all keys, including those that were revoked or have expired."""
-        return await self._all(Key, "/keys")
+        return await self._all(schemas.people.Key, "/keys")
 
     async def make_key(
         self,
@@ -125,15 +133,15 @@ class Operation(Connection):
         """
         until = None if expires_at is None else expires_at.isoformat()
         body = {"owner": owner, "role": role, "expires_at": until, "surgeons": surgeons}
-        return await self._ask(NewKey, "POST", "/keys", body, idempotent=False)
+        return await self._ask(schemas.people.NewKey, "POST", "/keys", body, idempotent=False)
 
     async def revoke_key(self, key: str) -> Key:
         """Revoke a key permanently; `key` is its id, the eight characters after "skills_"."""
-        return await self._ask(Key, "DELETE", "/keys/{key}", key=key)
+        return await self._ask(schemas.people.Key, "DELETE", "/keys/{key}", key=key)
 
     async def ready(self) -> Ready:
         """Check whether the service can work; while it starts, the request is retried as for every busy response."""
-        return await self._get(Ready, "/readyz")
+        return await self._get(schemas.responses.Ready, "/readyz")
 
     async def served_at(self, surgeon: str, suture: str, moment: datetime) -> ServedAt:
         """Return the version of a style that was served at a moment, with proofs that need no trust in the service.
@@ -143,8 +151,10 @@ class Operation(Connection):
             suture: The suture type.
             moment: The moment, with a time zone.
         """
-        return await self._get(ServedAt, "/history", surgeon=surgeon, suture=suture, at=moment.isoformat())
+        return await self._get(
+            schemas.responses.ServedAt, "/history", surgeon=surgeon, suture=suture, at=moment.isoformat()
+        )
 
     async def checkpoint(self) -> SignedCheckpoint:
         """Return the newest signed checkpoint of the history, to be kept elsewhere."""
-        return await self._get(SignedCheckpoint, "/history/checkpoint")
+        return await self._get(schemas.responses.SignedCheckpoint, "/history/checkpoint")

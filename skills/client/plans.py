@@ -1,24 +1,25 @@
 """Calls of plans, their playback in the simulator, the bag that a robot replays, and timelines of motions."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack
 
+from skills import schemas
 from skills.client.connection import Connection
 from skills.client.files import Progress
 from skills.client.policies import Position
 from skills.errors import BadInput
 from skills.keywords import PlanKeywords, ReachKeywords
 from skills.remedies import did_you_mean
-from skills.schemas.operation import Job
-from skills.schemas.plans import Plan, PlanSummary, Trajectory
-from skills.schemas.playbacks import Comparison, Playback
-from skills.schemas.reach import Reach
-from skills.schemas.timelines import MotionTimeline
 
 if TYPE_CHECKING:
-    from skills.schemas.plans import SuturePointIn
-    from skills.schemas.playbacks import ArmErrorsIn
+    from skills.schemas.operation import Job
+    from skills.schemas.plans import Plan, PlanSummary, SuturePointIn, Trajectory
+    from skills.schemas.playbacks import ArmErrorsIn, Comparison, Playback
+    from skills.schemas.reach import Reach
+    from skills.schemas.timelines import MotionTimeline
 
 BAG, MCAP = "application/zip", "application/vnd.mcap"
 TRAJECTORY = "/plans/{plan}/trajectory"
@@ -32,7 +33,7 @@ class Plans(Connection):
         self,
         surgeon: str,
         suture: str,
-        suture_points: "Sequence[SuturePointIn | Mapping[str, Any] | Position]",
+        suture_points: Sequence[SuturePointIn | Mapping[str, Any] | Position],
         **options: Unpack[PlanKeywords],
     ) -> Plan:
         """Stack a style at suture points.
@@ -50,20 +51,23 @@ class Plans(Connection):
         """
         points = [_point(point) for point in suture_points]
         return await self._ask(
-            Plan, "POST", "/plans", {"surgeon": surgeon, "suture": suture, "suture_points": points, **options}
+            schemas.plans.Plan,
+            "POST",
+            "/plans",
+            {"surgeon": surgeon, "suture": suture, "suture_points": points, **options},
         )
 
     async def reach(self, surgeon: str, suture: str, **options: Unpack[ReachKeywords]) -> Reach:
         """Map where a style can be planned: reach, joint margins and clearances at each place of a box."""
-        return await self._ask(Reach, "POST", "/reach", {"surgeon": surgeon, "suture": suture, **options})
+        return await self._ask(schemas.reach.Reach, "POST", "/reach", {"surgeon": surgeon, "suture": suture, **options})
 
     async def plans(self) -> list[PlanSummary]:
         """List plans, the newest first, each with its newest playback."""
-        return await self._all(PlanSummary, "/plans")
+        return await self._all(schemas.plans.PlanSummary, "/plans")
 
     async def plan_of(self, plan: str) -> Plan:
         """Return a plan."""
-        return await self._get(Plan, "/plans/{plan}", plan=plan)
+        return await self._get(schemas.plans.Plan, "/plans/{plan}", plan=plan)
 
     async def timeline(self, source: Source, sha256: str) -> MotionTimeline:
         """Return a recording, a demonstration, a policy version's learnt path or a plan as columns on one clock.
@@ -72,7 +76,9 @@ class Plans(Connection):
             source: The kind of resource, as in its address.
             sha256: Its digest.
         """
-        return await self._get(MotionTimeline, "/timelines/{source}/{sha256}", source=source, sha256=sha256)
+        return await self._get(
+            schemas.timelines.MotionTimeline, "/timelines/{source}/{sha256}", source=source, sha256=sha256
+        )
 
     async def timeline_mcap(self, source: Source, sha256: str) -> bytes:
         """Return the same as an MCAP file for viewers such as Foxglove; it is not for execution."""
@@ -81,7 +87,7 @@ class Plans(Connection):
     async def trajectory(self, plan: str, pass_index: int | None = None) -> Trajectory:
         """Return a plan's sampled motion, or that of one pass, counted from 0."""
         # `pass` is a keyword of Python, so it cannot be a keyword argument
-        return await self._get(Trajectory, TRAJECTORY, plan=plan, **{"pass": pass_index})
+        return await self._get(schemas.plans.Trajectory, TRAJECTORY, plan=plan, **{"pass": pass_index})
 
     async def replay_bag(
         self, plan: str, pass_index: int | None = None, *, handoff: Literal["none"] | None = None
@@ -114,10 +120,12 @@ class Plans(Connection):
 
     async def compare(self, plan: str, demo: str, pass_index: int = 0) -> Comparison:
         """Compare a pass of a plan, counted from 0, with a demonstration cut from the recording of its replay."""
-        return await self._get(Comparison, "/plans/{plan}/comparison", plan=plan, demo=demo, **{"pass": pass_index})
+        return await self._get(
+            schemas.playbacks.Comparison, "/plans/{plan}/comparison", plan=plan, demo=demo, **{"pass": pass_index}
+        )
 
     async def play(
-        self, plan: str, errors: "Literal['calibrated', 'uncalibrated'] | ArmErrorsIn | Mapping[str, Any] | None" = None
+        self, plan: str, errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | Mapping[str, Any] | None = None
     ) -> Job:
         """Request the playback of a plan in the simulator; the job's result is a `PlaybackResult`.
 
@@ -126,11 +134,11 @@ class Plans(Connection):
             errors: The errors of the arms that are to play it: a default, or the laboratory's own as
                 `skills calibrate-arm` writes them; default: those that the installation states.
         """
-        return await self._ask(Job, "POST", "/playbacks", {"plan": plan, "errors": errors})
+        return await self._ask(schemas.operation.Job, "POST", "/playbacks", {"plan": plan, "errors": errors})
 
     async def playback(self, playback: str) -> Playback:
         """Return the simulator's verdict."""
-        return await self._get(Playback, "/playbacks/{playback}", playback=playback)
+        return await self._get(schemas.playbacks.Playback, "/playbacks/{playback}", playback=playback)
 
     async def picture(self, playback: str) -> bytes:
         """Return the picture of a playback, a PNG."""
@@ -138,7 +146,7 @@ class Plans(Connection):
 
     async def draw(self, playback: str) -> Job:
         """Request the film and plots of a playback; returns the job, which each new playback starts itself."""
-        return await self._ask(Job, "POST", "/playbacks/{playback}/pictures", playback=playback)
+        return await self._ask(schemas.operation.Job, "POST", "/playbacks/{playback}/pictures", playback=playback)
 
     async def animation(self, playback: str, kind: Literal["mp4", "gif"] = "mp4") -> bytes:
         """Return the film of a playback, once it is drawn."""

@@ -3,21 +3,25 @@
 Errors about a file that is sent or received are those of `skills.errors`.
 """
 
+from __future__ import annotations
+
 import email.utils
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import httpx2 as httpx
 from pydantic import ValidationError
 
+from skills import schemas
 from skills.errors import SkillsError
 from skills.remedies import read_remedies
-from skills.schemas.operation import Job
-from skills.schemas.responses import Problem as ProblemDocument
-from skills.schemas.responses import WrongField
+
+if TYPE_CHECKING:
+    from skills.schemas.operation import Job
+    from skills.schemas.responses import WrongField
 
 TOO_MANY, UNAVAILABLE = 429, 503
 PARTS_OF_A_REQUEST = ("body", "query", "path", "header")
@@ -33,7 +37,7 @@ class RefusedArgument:
     given: object = None
 
     @classmethod
-    def of(cls, field: WrongField) -> "RefusedArgument":
+    def of(cls, field: WrongField) -> RefusedArgument:
         """Return it from an entry of a problem's `errors`, whose path begins with the part of the request."""
         part, *path = field.where.split(".")
         return cls(tuple(path if part in PARTS_OF_A_REQUEST else [part, *path]), field.why)
@@ -57,7 +61,7 @@ class Problem(SkillsError):
         retry_after_s: Seconds after which the service asks for a retry; None if it does not.
     """
 
-    def __init__(self, document: ProblemDocument, retry_after_s: float | None = None) -> None:
+    def __init__(self, document: schemas.responses.Problem, retry_after_s: float | None = None) -> None:
         super().__init__(
             document.reason or document.detail, *read_remedies(document.remedies or ()), **(document.numbers or {})
         )
@@ -152,12 +156,12 @@ def problem_of(answer: httpx.Response) -> Problem:
     """Return the error of an error response whose body was read."""
     if answer.headers.get("content-type", "").startswith("application/problem+json"):
         try:
-            return Problem(ProblemDocument.model_validate_json(answer.content), _retry_after_s(answer))
+            return Problem(schemas.responses.Problem.model_validate_json(answer.content), _retry_after_s(answer))
         except ValidationError:
             pass  # from a program in between, with a document of its own
     reason = f"{answer.request.url.netloc.decode()} answered {answer.status_code}, but not as suture-skills does."
     advice = "Check that the address is the service's, and the proxies in front of it."
-    stranger = ProblemDocument.model_construct(
+    stranger = schemas.responses.Problem.model_construct(
         type="",
         title="Refused",
         status=answer.status_code,

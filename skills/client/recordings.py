@@ -1,18 +1,23 @@
 """Calls of recordings, of the hand-offs proposed in them, and of datasets of their demonstrations."""
 
+from __future__ import annotations
+
 import tempfile
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
+from skills import schemas
 from skills.client.connection import Connection
 from skills.client.files import Progress
 from skills.client.waiting import in_thread
 from skills.keywords import DatasetKeywords, TableKeywords
 from skills.schemas import ProposalDecision, ProposalState
-from skills.schemas.datasets import DatasetEpisodes
-from skills.schemas.demos import Proposal
-from skills.schemas.operation import Job
-from skills.schemas.recordings import Recording, RecordingPreview, RecordingSummary, SuturePoints
+
+if TYPE_CHECKING:
+    from skills.schemas.datasets import DatasetEpisodes
+    from skills.schemas.demos import Proposal
+    from skills.schemas.operation import Job
+    from skills.schemas.recordings import Recording, RecordingPreview, RecordingSummary, SuturePoints
 
 
 class Recordings(Connection):
@@ -37,7 +42,9 @@ class Recordings(Connection):
             progress: Called with the bytes sent and the total; it starts again from 0 when a lost upload is retried.
             **table: Statements about a recording that it does not make itself.
         """
-        return await self._upload(Recording, "/recordings", recording, media_type, progress, surgeon=surgeon, **table)
+        return await self._upload(
+            schemas.recordings.Recording, "/recordings", recording, media_type, progress, surgeon=surgeon, **table
+        )
 
     async def preview_recording(
         self,
@@ -51,15 +58,17 @@ class Recordings(Connection):
 
         Arguments are those of `add_recording`. A table without times is counted, and its durations and rates are None.
         """
-        return await self._upload(RecordingPreview, "/recordings/preview", recording, media_type, progress, **table)
+        return await self._upload(
+            schemas.recordings.RecordingPreview, "/recordings/preview", recording, media_type, progress, **table
+        )
 
     async def recordings(self) -> list[RecordingSummary]:
         """List recordings, the newest first."""
-        return await self._all(RecordingSummary, "/recordings")
+        return await self._all(schemas.recordings.RecordingSummary, "/recordings")
 
     async def recording(self, recording: str) -> Recording:
         """Return a recording by its digest."""
-        return await self._get(Recording, "/recordings/{recording}", recording=recording)
+        return await self._get(schemas.recordings.Recording, "/recordings/{recording}", recording=recording)
 
     async def delete_recording(self, recording: str) -> None:
         """Delete a recording without demonstrations, by its digest."""
@@ -81,7 +90,9 @@ class Recordings(Connection):
             surgeon: Only those of this surgeon's demonstrations and recordings.
             suture: Only accepted ones, whose demonstration is of this suture type.
         """
-        return await self._all(Proposal, "/proposals", state=state, recording=recording, surgeon=surgeon, suture=suture)
+        return await self._all(
+            schemas.demos.Proposal, "/proposals", state=state, recording=recording, surgeon=surgeon, suture=suture
+        )
 
     async def decide_proposal(
         self, recording: str, number: int, state: ProposalDecision, *, note: str | None = None
@@ -95,7 +106,7 @@ class Recordings(Connection):
             note: Why.
         """
         return await self._ask(
-            Proposal,
+            schemas.demos.Proposal,
             "PUT",
             "/recordings/{recording}/proposals/{number}",
             {"state": state, "note": note},
@@ -107,7 +118,7 @@ class Recordings(Connection):
         self, scene: Path | bytes, arm: str | None = None, frame: str | None = None
     ) -> SuturePoints:
         """Read the Entry and Exit marks of a simulator's MCAP file, in an arm's base frame."""
-        return await self._upload(SuturePoints, "/suture-points", scene, arm=arm, frame=frame)
+        return await self._upload(schemas.recordings.SuturePoints, "/suture-points", scene, arm=arm, frame=frame)
 
     async def export_dataset(self, **options: Unpack[DatasetKeywords]) -> Job:
         """Request the export of demonstrations; the job's result is a `DatasetResult` with the dataset's digest.
@@ -118,7 +129,7 @@ class Recordings(Connection):
         Raises:
             Problem: Of status 409 if a consent does not cover the export.
         """
-        return await self._ask(Job, "POST", "/datasets", options)
+        return await self._ask(schemas.operation.Job, "POST", "/datasets", options)
 
     async def save_dataset(self, dataset: str, to: Path, progress: Progress | None = None) -> Path:
         """Download a dataset to a .zip file, or unpack it into a new folder, after verifying every file of it.
@@ -139,7 +150,7 @@ class Recordings(Connection):
 
     async def dataset_episodes(self, dataset: str) -> DatasetEpisodes:
         """Return the recording and the demonstrations of each episode of a dataset, which does not name them itself."""
-        return await self._get(DatasetEpisodes, "/datasets/{dataset}/episodes", dataset=dataset)
+        return await self._get(schemas.datasets.DatasetEpisodes, "/datasets/{dataset}/episodes", dataset=dataset)
 
     async def delete_dataset(self, dataset: str) -> None:
         """Delete a dataset and the job that made it; its demonstrations stay."""

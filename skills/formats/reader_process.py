@@ -29,6 +29,7 @@ from skills.errors import BadInput, SkillsError, TooLarge, Unanswered, UnknownFo
 from skills.formats import read_recording, write_mcap
 from skills.formats.cells import load_arrow
 from skills.formats.parsed import ParsedContent, parse_recording
+from skills.formats.rosbag import ros2_types
 from skills.remedies import read_remedies
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer
@@ -100,7 +101,7 @@ KNOWN = packing.known(
 class ConfinedReader:
     """`read_recording` in a fork for each call, with a limit on concurrent calls; thread-safe.
 
-    Use it as a context manager: the fork server runs for the duration of the block.
+    Use it as a context manager: the fork server runs from the first call to the end of the block.
     """
 
     def __init__(self, limits: ProcessLimits, *, at_once: int, target: str = READ) -> None:
@@ -110,8 +111,7 @@ class ConfinedReader:
         self._turns = Turns(at_once, waiting=WAITING, waiting_of_one=WAITING_OF_ONE)
 
     def __enter__(self) -> Self:
-        """Start the fork server."""
-        self.server.start()
+        """Return the reader."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -178,6 +178,7 @@ def get_ready() -> None:
     Each fork that reads a table would import `pyarrow` again, which takes 30 times as long as reading a small one.
     """
     load_arrow()
+    ros2_types()
     for folder in cache_folders():
         check_cache_folder(folder)
     stamps_ns, tip_mm = np.array([0, 10_000_000]), np.zeros((2, 3))

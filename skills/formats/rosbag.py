@@ -20,13 +20,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Literal
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Literal
 
 import apsw
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Format, Integrity, Recording, Topic
@@ -36,6 +35,10 @@ from skills.formats.archive import printable, refusing
 from skills.formats.bag_writer import Message, write_messages
 from skills.formats.mcap import read_mcap
 from skills.remedies import did_you_mean
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys.store import Typestore
 
 TABLES = frozenset({"schema", "metadata", "topics", "message_definitions", "messages"})
 STATISTICS = frozenset({"sqlite_stat1", "sqlite_stat4", "sqlite_sequence", "sqlite_schema", "sqlite_temp_schema"})
@@ -146,7 +149,6 @@ Suffix = Literal[".bag", ".db3", ".mcap"]
 _FORMATS: dict[Suffix, Format] = {".bag": "rosbag1", ".db3": "rosbag2", ".mcap": "mcap"}
 _NAMES = {".bag": "ROS 1 bag", ".db3": "SQLite bag (.db3)", ".mcap": "MCAP file"}
 _NANO = 1_000_000_000
-_ROS2 = get_typestore(Stores.ROS2_JAZZY)
 
 guard_connections()
 
@@ -305,14 +307,25 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
     return stamps_ns, place_mm[seen]
 
 
+@cache
+def ros2_types() -> "Typestore":
+    """Return the message definitions of ROS 2, with all of rosbags loaded: a fifth of a second that only bags need."""
+    import rosbags.highlevel  # noqa: F401  before a process is forked for a bag
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
 @contextmanager
-def _reading(paths: Sequence[Path]) -> Iterator[AnyReader]:
+def _reading(paths: Sequence[Path]) -> "Iterator[AnyReader]":
     advice = "Copy it again, or convert it with `ros2 bag convert` or `rosbags-convert`."
     what = f"The {_NAMES.get(paths[0].suffix, 'bag')}"
     for path in paths:
         with path.open("rb") as file:
             _check_indexed(file.read(HEADER_BYTES))
-    with refusing(what, advice), AnyReader(paths, default_typestore=_ROS2) as reader:
+    from rosbags.highlevel import AnyReader
+
+    with refusing(what, advice), AnyReader(paths, default_typestore=ros2_types()) as reader:
         yield reader
 
 
@@ -330,26 +343,26 @@ def _check_indexed(head: bytes) -> None:
         )
 
 
-def _convert(reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
+def _convert(reader: "AnyReader", out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
     here = _topics(reader)
     if not any(topics.arm_of_pose(topic.name, topic.type) for topic in here):
         said = ", ".join(f"{topic.name} ({topic.type})" for topic in here[:20])
         raise NoUsableTopic(f"No topic has the pose of a PSM. It has {said or 'no topics'}.")
     used = [one for one in reader.connections if topics.meaning(one.topic, one.msgtype) is not None]
-    types = reader.typestore if reader.is2 else _ROS2
+    types = reader.typestore if reader.is2 else ros2_types()
     definitions = {kind: types.generate_msgdef(kind, ros_version=2)[0] for kind in {one.msgtype for one in used}}
     write_messages(_messages(reader, used), out, notes, definitions)
     return here
 
 
-def _topics(reader: AnyReader) -> tuple[Topic, ...]:
+def _topics(reader: "AnyReader") -> tuple[Topic, ...]:
     counts: Counter[tuple[str, str]] = Counter()
     for connection in reader.connections:
         counts[connection.topic, connection.msgtype] += connection.msgcount
     return topics.counted(counts)
 
 
-def _messages(reader: AnyReader, used: Sequence[Any]) -> Iterator[Message]:
+def _messages(reader: "AnyReader", used: Sequence[Any]) -> Iterator[Message]:
     """Yield the messages of some connections as CDR."""
     for connection, log_ns, data in reader.messages(connections=used):
         kind, publisher = connection.msgtype, getattr(connection.ext, "callerid", None) or ""
@@ -359,7 +372,7 @@ def _messages(reader: AnyReader, used: Sequence[Any]) -> Iterator[Message]:
 def _cdr(data: bytes, kind: str) -> bytes:
     """Convert a message of ROS 1; a damaged one becomes empty, so that `read_mcap` refuses or omits its topic."""
     try:
-        return bytes(_ROS2.ros1_to_cdr(data, kind))
+        return bytes(ros2_types().ros1_to_cdr(data, kind))
     except Exception:  # on a damaged message rosbags may raise anything
         return b"\0\1\0\0"
 

@@ -29,7 +29,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import correlate1d
 
 from skills.arithmetic import product
 from skills.arrays import Floats, freeze, frozen
@@ -393,6 +392,8 @@ def laid_rotations(rotation_xyzw: Floats, ends: Floats) -> Floats:
 
 def _warp(tip_mm: Floats, mean_mm: Floats) -> Floats:
     """Return the place in a motion, an index with fraction, that corresponds to each phase of the mean, (PHASES,)."""
+    from scipy.ndimage import correlate1d  # here: a fifth of a second that only learning needs
+
     pairs = dtw(mean_mm, tip_mm).pairs
     places = np.bincount(pairs[:, 0], pairs[:, 1]) / np.bincount(pairs[:, 0])
     smooth = np.maximum.accumulate(correlate1d(places, WARP_SMOOTHING, mode="nearest"))

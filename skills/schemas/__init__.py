@@ -12,14 +12,32 @@ A use case returns the model of its answer; rows store parts of it as typed colu
 Lengths are mm; the frame of a position is in a field of its own.
 """
 
-from dataclasses import dataclass
+from importlib import import_module
 from reprlib import Repr
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Field
 
-from skills.fields import Documented, Sha256, schema
-from skills.gridworld.grid import GridWorld
+from skills.fields import Documented, Sha256
+
+if TYPE_CHECKING:  # those of the client
+    # isort: off
+    from skills.schemas import cards as cards, comparison as comparison, datasets as datasets, demos as demos
+    from skills.schemas import operation as operation, people as people, plans as plans, playbacks as playbacks
+    from skills.schemas import policies as policies, pose_styles as pose_styles, reach as reach
+    from skills.schemas import recordings as recordings, responses as responses, results as results, scores as scores
+    from skills.schemas import timelines as timelines, training as training
+    # isort: on
+
+
+def __getattr__(noun: str) -> ModuleType:
+    """Import a module of schemas at its first use: a call of the client needs those of its noun alone."""
+    try:
+        return import_module(f"{__name__}.{noun}")
+    except ModuleNotFoundError as error:
+        raise AttributeError(noun) from error
+
 
 SHORT = Repr()
 # Limits of `repr` in a notebook.
@@ -76,24 +94,6 @@ class Page(Given, Generic[T]):
 
     items: list[T]
     next: int | str | None
-
-
-@schema
-@dataclass(frozen=True)
-class Grid(GridWorld):
-    """A grid world: the centre of the state (ix * ny + iy) * nz + iz is `origin_mm + cell_mm * (ix, iy, iz)`."""
-
-
-@schema
-@dataclass(frozen=True)
-class ChosenGrid(GridWorld):
-    """A demonstration's grid world, and whether it is the paper's or was fitted to the path.
-
-    Attributes:
-        chosen: paper or fit.
-    """
-
-    chosen: str
 
 
 class PolicyName(Given):

@@ -11,8 +11,9 @@ from pydantic import Field
 
 from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
 from skills.gridworld.reward import RewardLevels
-from skills.schemas import DemoOutcome, Given, Grid, PolicyName
+from skills.schemas import DemoOutcome, Given, PolicyName
 from skills.schemas.demos import DemoReport
+from skills.schemas.grids import Grid
 from skills.schemas.people import Consent, SutureType
 from skills.schemas.policies import Combined, Coverage, GridCertificate, TrainingFigures
 

@@ -11,7 +11,8 @@ from skills.demonstration.quality import MotionReport
 from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
 from skills.gridworld.grid import MAX_HYSTERESIS, GridMode, PathReport
 from skills.gridworld.reward import RewardLevels
-from skills.schemas import ChosenGrid, DemoOutcome, Given, ProposalDecision, ProposalState
+from skills.schemas import DemoOutcome, Given, ProposalDecision, ProposalState
+from skills.schemas.grids import ChosenGrid
 from skills.schemas.requests import Name, Schema, SlugField, shown
 
 Hysteresis = Annotated[

@@ -18,7 +18,8 @@ from skills.learning.q_learning import Training
 from skills.learning.ties import ShortestApproach
 from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass
-from skills.schemas import DemoOutcome, Given, Grid, PolicyName
+from skills.schemas import DemoOutcome, Given, PolicyName
+from skills.schemas.grids import Grid
 from skills.schemas.requests import PointIn, Schema, shown
 
 

@@ -37,8 +37,9 @@ from skills.library.policies.releases import Style
 from skills.library.policies.requests import TrainingRequest
 from skills.library.recordings.recordings import Parser, stored_recording
 from skills.remedies import Action, Remedy
-from skills.schemas import DemoOutcome, Grid
+from skills.schemas import DemoOutcome
 from skills.schemas import policies as schemas
+from skills.schemas.grids import Grid
 from skills.schemas.policies import PolicyManifest
 from skills.schemas.training import CombineIn
 from skills.settings import Settings

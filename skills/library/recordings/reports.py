@@ -7,8 +7,8 @@ from skills.demonstration.demonstration import Demo
 from skills.demonstration.quality import describe
 from skills.demonstration.recording import equal_samples
 from skills.gridworld.grid import PAPER_GRID, GridPath, describe_path
-from skills.schemas import ChosenGrid
 from skills.schemas.demos import DemoReport
+from skills.schemas.grids import ChosenGrid
 
 EQUAL_SHARE = 0.1  # ours: an arm that rests on exact encoder values for a tenth of the time is no reason for advice
 
