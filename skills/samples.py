@@ -5,7 +5,8 @@ is available on request from its authors and is not part of this project. Sendin
 recording is identified by its bytes and a demonstration by its part of the recording. An error is recorded for its
 trial, and the others continue.
 
-`evaluate_hand_offs` reads such a folder without a service, and compares the proposed hand-offs with the transcribed.
+`evaluate_hand_offs` reads such a folder without a service, and compares the proposed hand-offs with the transcribed,
+and the proposed transfers of a needle or a thread with the changes of hands in its motion primitives.
 """
 
 import io
@@ -20,11 +21,13 @@ from tempfile import TemporaryDirectory
 from typing import IO
 
 from skills.client import Client, Problem
+from skills.demonstration.partner import closed_jaw, find_transfers
 from skills.demonstration.recording import Recording as Recorded
+from skills.demonstration.recording import base_frames
 from skills.demonstration.segments import Segment, propose_by_arm
 from skills.errors import BadInput, BadRecording, SkillsError
 from skills.formats.archive import pack
-from skills.formats.jigsaws import Skill, Trial, meta_line, read_jigsaws, trials
+from skills.formats.jigsaws import RATE_HZ, Skill, Trial, meta_line, read_jigsaws, trials
 from skills.remedies import did_you_mean
 from skills.schemas.demos import Demonstration
 from skills.schemas.recordings import Recording
@@ -80,7 +83,7 @@ def write_samples(folder: Path) -> list[tuple[Path, str]]:
     return written
 
 
-NOT_FOUND = "not-found"
+NOT_FOUND, IN_ONE_CELL = "not-found", "never-leaves-goal"
 
 
 @dataclass
@@ -95,6 +98,7 @@ class Sent:
         recording: The recording's digest; None if it was refused.
         proposed: The number of hand-offs that the service proposed, of the requested arm.
         demos: The digests of those that became demonstrations.
+        left_out: Those that cannot become one because their path fits into one cell, as text.
         problems: The errors, as text.
     """
 
@@ -105,16 +109,22 @@ class Sent:
     recording: str | None = None
     proposed: int = 0
     demos: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
 
-def find_trials(folder: Path, tasks: Sequence[str] = ()) -> list[Trial]:
+def find_trials(folder: Path, tasks: Sequence[str] = (), primitives: Path | None = None) -> list[Trial]:
     """Return the trials in a folder, of all tasks or of some.
+
+    Args:
+        folder: The folder.
+        tasks: Names of tasks; all if there are none.
+        primitives: A folder with motion primitives, if they are not in `folder`.
 
     Raises:
         BadInput: There are none.
     """
-    there = list(trials(folder))
+    there = list(trials(folder, primitives))
     found = [trial for trial in there if not tasks or trial.task in tasks]
     if there and not found:
         here = sorted({trial.task for trial in there})
@@ -209,19 +219,21 @@ def _cut(
             )
             sent.demos.append(demo.id)
         except SkillsError as error:
-            sent.problems.append(f"{part.arm} {part.start_s:.1f} to {part.end_s:.1f} s: {worded(error)}")
+            refused = sent.left_out if error.kind == IN_ONE_CELL else sent.problems
+            refused.append(f"{part.arm} {part.start_s:.1f} to {part.end_s:.1f} s: {worded(error)}")
 
 
 @contextmanager
 def _packed(trial: Trial) -> Iterator[Path]:
-    """Yield the file to send: the kinematics, zipped with its gestures and rating if there are any."""
-    if trial.transcription is None and trial.rated is None:
+    """Yield the file to send: the kinematics, zipped with its labels and rating if there are any."""
+    if trial.transcription is None and trial.primitives is None and trial.rated is None:
         yield trial.kinematics
         return
     with TemporaryDirectory() as folder, trial.kinematics.open("rb") as kinematics:
         members: dict[str, IO[bytes]] = {f"{trial.name}.txt": kinematics}
-        if trial.transcription is not None:
-            members[f"transcriptions/{trial.name}.txt"] = io.BytesIO(trial.transcription.read_bytes())
+        for name, path in (("transcriptions", trial.transcription), ("motion_primitives", trial.primitives)):
+            if path is not None:
+                members[f"{name}/{trial.name}.txt"] = io.BytesIO(path.read_bytes())
         if trial.rated is not None:
             members["meta_file.txt"] = io.BytesIO(meta_line(trial.rated).encode())
         path = Path(folder) / "trial.zip"
@@ -232,35 +244,52 @@ def _packed(trial: Trial) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """The proposed hand-offs of one task, compared with the transcribed ones.
+    """Proposals of one task, compared with one kind of labels, which they do not see.
 
     Attributes:
         task: Name of the task.
-        trials: Number of trials that were read.
+        proposals: "hand-offs"; "transfers" of what is held, at the moment at which it leaves the giver; or
+            "a jaw opens", their rival, by which every release gives to the other hand.
+        labels: "transcription" or "motion primitives"; None if no trial of the task has any.
+        trials: Number of trials with these labels, or of all that were read if there are none.
         left_out: Number of trials that cannot be read, such as empty files.
-        proposed: Number of proposals, of both hands; the transcriptions were not used.
-        transcribed: Number of hand-offs in the transcriptions; None if no trial has one.
-        precision: Share of the proposals that are transcribed; None likewise, or without a proposal.
-        recall: Share of the transcribed hand-offs that are proposed; None likewise.
-        brier: Mean squared difference between a proposal's confidence and 1 if transcribed, else 0; None likewise.
+        proposed: Number of proposals, of both hands, in these trials.
+        labelled: Number of labelled hand-offs or changes of hands; None likewise.
+        precision: Share of the proposals that are labelled; None likewise, or without a proposal.
+        recall: Share of the labelled that are proposed; None likewise.
+        error_s: Mean distance of a matched transfer from the end of the labelled release; None of hand-offs.
+        brier: Mean squared difference between a proposal's confidence and 1 if labelled, else 0; None likewise.
     """
 
     task: str
+    proposals: str
+    labels: str | None
     trials: int
     left_out: int
     proposed: int
-    transcribed: int | None
+    labelled: int | None
     precision: float | None
     recall: float | None
+    error_s: float | None
     brier: float | None
 
-    @property
-    def a_trial(self) -> float:
-        """Proposals per trial."""
-        return self.proposed / max(self.trials, 1)
 
-
+HAND_OFFS, TRANSFERS, OPENINGS, UNKNOWN = "hand-offs", "transfers", "a jaw opens", ""
+LABELS = {HAND_OFFS: "transcription", TRANSFERS: "motion primitives", OPENINGS: "motion primitives"}
+COUNTS = ("proposed", "labelled", "matched")
+NO_LABELS = "no trial has a transcription or motion primitives (--primitives), so there is nothing to compare with."
+HELD = re.compile(r"((?:Grasp|Release)\([LR]), (Needle|Thread)\)")
+WITHIN_S = 1.0  # between a transfer and the end of the labelled release that are the same
 SHARED = 0.5  # of the shorter of a label and a proposal that are the same hand-off
+
+
+@dataclass(frozen=True)
+class HandChange:
+    """The moment at which something leaves a hand for the other, and the confidence of a proposal."""
+
+    giver: str
+    at_s: float
+    confidence: float | None = None
 
 
 @dataclass(frozen=True)
@@ -272,12 +301,14 @@ class Agreement:
         labelled: Number of labelled hand-offs.
         matched: Number of pairs of one proposal and one label that share `SHARED` of the shorter, of one arm.
         confident: Confidence of each proposal, and whether it was matched; without those that have none.
+        errors_s: Of each pair of moments, that of the proposal after that of the label.
     """
 
     proposed: int
     labelled: int
     matched: int
     confident: tuple[tuple[float, bool], ...]
+    errors_s: tuple[float, ...] = ()
 
 
 def agreement(recording: Recorded) -> Agreement:
@@ -306,41 +337,108 @@ def _shared(one: Segment, other: Segment) -> float:
 
 
 def evaluate_hand_offs(found: Iterable[Trial]) -> list[Evaluated]:
-    """Compare proposed with transcribed hand-offs, task by task; precision and recall only of trials with both.
+    """Compare proposals with labels, task by task and kind by kind.
 
     Args:
         found: The trials, from `find_trials`.
     """
-    by_task: dict[str, list[tuple[bool, Agreement | None]]] = {}
+    by_task: dict[str, list[dict[str, Agreement] | None]] = {}
     for trial in found:
-        by_task.setdefault(trial.task, []).append((trial.transcription is not None, _agreement(trial)))
-    return [_evaluated(task, rows) for task, rows in by_task.items()]
+        by_task.setdefault(trial.task, []).append(_agreements(trial))
+    return [one for task, rows in by_task.items() for one in _evaluated(task, rows)]
 
 
-def _agreement(trial: Trial) -> Agreement | None:
-    """Compare one trial; None if it cannot be read."""
+def _agreements(trial: Trial) -> dict[str, Agreement] | None:
+    """Compare one trial with each kind of labels that it has; None if it cannot be read."""
+    files = trial.transcription, trial.primitives
+    texts = ["" if path is None else path.read_text(errors="replace") for path in files]
     try:
         with trial.kinematics.open("rb") as file:
-            transcription = "" if trial.transcription is None else trial.transcription.read_text(errors="replace")
-            return agreement(read_jigsaws(file, transcription))
+            recording = read_jigsaws(file, *texts)
     except BadRecording:
         return None
+    found = transfer_agreements(recording) if trial.primitives else {}
+    kind = HAND_OFFS if trial.transcription else UNKNOWN
+    return found if trial.primitives and not trial.transcription else found | {kind: agreement(recording)}
 
 
-def _evaluated(task: str, rows: Sequence[tuple[bool, Agreement | None]]) -> Evaluated:
-    read = [one for _, one in rows if one is not None]
-    both = [one for has_labels, one in rows if one is not None and has_labels]
-    proposed, labelled, matched = (
-        sum(getattr(one, name) for one in both) for name in ("proposed", "labelled", "matched")
-    )
-    missed = [(confidence - is_matched) ** 2 for one in both for confidence, is_matched in one.confident]
-    return Evaluated(
-        task=task,
-        trials=len(read),
-        left_out=len(rows) - len(read),
-        proposed=sum(one.proposed for one in read),
-        transcribed=labelled if both else None,
-        precision=matched / proposed if proposed else None,
-        recall=matched / labelled if labelled else None,
-        brier=sum(missed) / len(missed) if missed else None,
-    )
+def transfer_agreements(recording: Recorded) -> dict[str, Agreement]:
+    """Compare transfers, and the openings of a jaw, with the changes of hands in the motion primitives.
+
+    Args:
+        recording: A recording with motion primitives; what is proposed after the last of them is not counted.
+    """
+    closed = {arm: closed_jaw(recording, arm) or [] for arm in recording.arms}
+    transfers = find_transfers(recording, closed, base_frames(recording))
+    proposed = {
+        TRANSFERS: [HandChange(one.giver, one.freed_s, one.confidence) for one in transfers],
+        OPENINGS: [HandChange(arm, span[1]) for arm, spans in closed.items() for span in spans],
+    }
+    last_ns = max((one.end_ns for one in recording.labels if one.kind == "primitive"), default=recording.origin_ns)
+    last_s = (last_ns - recording.origin_ns) / 1e9 + WITHIN_S
+    return {kind: _matched(some, hand_changes(recording), last_s) for kind, some in proposed.items()}
+
+
+def hand_changes(recording: Recorded) -> list[HandChange]:
+    """Return the changes of hands in the motion primitives: who lets go of the needle or the thread, and when.
+
+    It changes hands where one hand grasps it and the other releases it, without another grasp or release of it between,
+    and not both at once. The release ends with the sample after its last frame.
+    """
+    seen: dict[str, dict[int, set[str]]] = {}
+    for one in recording.labels:
+        if one.kind == "primitive" and (found := HELD.fullmatch(one.name)):
+            seen.setdefault(found[2], {}).setdefault(one.end_ns, set()).add(found[1])
+    changes = []
+    for moments in seen.values():
+        before: set[str] = set()
+        for end_ns, now in sorted(moments.items()):
+            for giver, grasp, release in (("PSM_left", "Grasp(R", "Release(L"), ("PSM_right", "Grasp(L", "Release(R")):
+                if now == {grasp, release} or (now == {release} and before == {grasp}):
+                    changes.append(HandChange(giver, (end_ns - recording.origin_ns) / 1e9 + 1.0 / RATE_HZ))
+            before = now
+    return changes
+
+
+def _matched(proposed: Sequence[HandChange], labelled: Sequence[HandChange], last_s: float) -> Agreement:
+    """Pair moments of one giver that are within `WITHIN_S`, the nearest first, each once."""
+    proposed = [one for one in proposed if one.at_s <= last_s]
+    near = sorted((abs(a.at_s - b.at_s), k, n) for k, a in enumerate(proposed) for n, b in enumerate(labelled))
+    pairs: dict[int, int] = {}
+    for apart_s, k, n in near:
+        if (
+            apart_s <= WITHIN_S
+            and proposed[k].giver == labelled[n].giver
+            and k not in pairs
+            and n not in pairs.values()
+        ):
+            pairs[k] = n
+    confident = tuple((one.confidence, k in pairs) for k, one in enumerate(proposed) if one.confidence is not None)
+    errors_s = tuple(proposed[k].at_s - labelled[n].at_s for k, n in pairs.items())
+    return Agreement(len(proposed), len(labelled), len(pairs), confident, errors_s)
+
+
+def _evaluated(task: str, rows: Sequence[dict[str, Agreement] | None]) -> Iterator[Evaluated]:
+    read = [one for one in rows if one is not None]
+    for kind in [one for one in LABELS if any(one in trial for trial in read)] or [UNKNOWN]:
+        both = [trial[kind] for trial in read if kind in trial]
+        count, labelled, matched = (sum(getattr(one, name) for one in both) for name in COUNTS)
+        missed = [(said - is_matched) ** 2 for one in both for said, is_matched in one.confident if kind]
+        errors_s = [abs(error_s) for one in both for error_s in one.errors_s]
+        yield Evaluated(
+            task=task,
+            proposals=kind or HAND_OFFS,
+            labels=LABELS.get(kind),
+            trials=len(both),
+            left_out=len(rows) - len(read),
+            proposed=count,
+            labelled=labelled if kind else None,
+            precision=_ratio(matched, count if kind else 0),
+            recall=_ratio(matched, labelled),
+            error_s=_ratio(sum(errors_s), len(errors_s)),
+            brier=_ratio(sum(missed), len(missed)),
+        )
+
+
+def _ratio(part: float, whole: int) -> float | None:
+    return round(part / whole, 4) if whole else None

@@ -5,6 +5,7 @@ Jobs are carried out by a thread (`cases.working`), except in one test, where th
 
 import io
 import json
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -449,11 +450,65 @@ def test_proposed_hand_offs_are_compared_with_the_transcribed_ones(skills, tmp_p
     code, said = skills("jigsaws", "evaluate", str(root), "--json")
     (one,) = json.loads(said)
     assert code == 0
-    assert (one["task"], one["trials"], one["left_out"], one["transcribed"]) == ("Suturing", 2, 1, 2)
-    assert one["recall"] * one["transcribed"] == pytest.approx(one["precision"] * one["proposed"])
+    assert (one["task"], one["trials"], one["left_out"], one["labelled"]) == ("Suturing", 2, 1, 2)
+    assert one["labels"] == "transcription"
+    assert one["recall"] * one["labelled"] == pytest.approx(one["precision"] * one["proposed"])
     assert one["brier"] is None, "both jaws move at once, so that no transfer gives a confidence"
     _, said = skills("jigsaws", "evaluate", str(root))
-    assert "transcribed" in said and "Suturing" in said
+    assert "transcription" in said and "Suturing" in said
+
+
+def test_without_labels_an_evaluation_says_why_it_is_empty(skills, tmp_path: Path) -> None:
+    root = trials.folder(tmp_path / "jigsaws")
+    shutil.rmtree(root / "Suturing" / "transcriptions")
+    (one,) = json.loads(skills("jigsaws", "evaluate", str(root), "--json")[1])
+    assert one["proposed"] > 0
+    assert [one[name] for name in ("labels", "labelled", "precision", "recall", "error_s", "brier")] == [None] * 6
+    code, said = skills("jigsaws", "evaluate", str(root))
+    assert code == 0
+    assert "Suturing: no trial has a transcription or motion primitives (--primitives)" in said
+
+
+def test_proposed_transfers_are_compared_with_motion_primitives(skills, tmp_path: Path) -> None:
+    """The right hand opens at 5 s and has moved 5 mm from the left one at 5.5 s; the left one gives nothing."""
+    root = trials.folder(tmp_path / "jigsaws")
+    (root / "Suturing" / "kinematics" / "AllGestures" / "Suturing_C002.txt").unlink()
+    shutil.rmtree(root / "Suturing" / "transcriptions")
+    table = trials.handing_over(opens_s=5.0, parts_s=5.5)
+    (root / "Suturing" / "kinematics" / "AllGestures" / "Suturing_B001.txt").write_bytes(trials.text(table))
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    lines = (
+        "Start Stop Motion Primitive",
+        "0 129 Grasp(L, Needle)",
+        "130 169 Release(R, Needle)",
+        "170 239 Pull(L, Needle)",
+    )
+    (labels / "Suturing_S02_T01.txt").write_text("\n".join(lines))
+    command = ("jigsaws", "evaluate", str(root), "--primitives", str(labels), "--json")
+    transfers, openings = json.loads(skills(*command)[1])
+    assert [transfers[name] for name in ("labels", "proposed", "labelled", "precision", "recall")] == [
+        "motion primitives", 1, 1, 1.0, 1.0,
+    ]  # fmt: skip
+    assert transfers["error_s"] == pytest.approx(170 / 30 - 5.5, abs=0.1)
+    assert (openings["proposals"], openings["proposed"], openings["precision"]) == ("a jaw opens", 2, 0.5)
+    (labels / "Suturing_S02_T01.txt").write_text("\n".join(lines).replace("R, Needle", "L, Needle", 1))
+    transfers, _ = json.loads(skills(*command)[1])
+    assert (transfers["labelled"], transfers["precision"], transfers["recall"]) == (0, 0.0, None)
+
+
+def test_a_proposal_in_one_cell_is_named_and_left_out(skills, tmp_path: Path) -> None:
+    root = trials.folder(tmp_path / "jigsaws")
+    shutil.rmtree(root / "Suturing" / "transcriptions")
+    (root / "Suturing" / "kinematics" / "AllGestures" / "Suturing_B001.txt").write_bytes(trials.text(trials.swaying()))
+    code, said = skills("jigsaws", "add", str(root), "--suture", "simple-interrupted", "--json")
+    small, large = json.loads(said)
+    assert code == 0, said
+    assert [(one["problems"], one["proposed"]) for one in (small, large)] == [([], 2), ([], 2)]
+    assert (small["demos"], len(small["left_out"]), len(large["demos"]), large["left_out"]) == ([], 2, 2, [])
+    assert all("one cell" in part for part in small["left_out"])
+    _, said = skills("jigsaws", "add", str(root), "--suture", "simple-interrupted")
+    assert "Suturing_B001, left out: PSM_" in said
 
 
 def test_a_trial_that_is_refused_does_not_stop_the_others(skills, tmp_path: Path) -> None:

@@ -76,6 +76,7 @@ RUN_BY: dict[str, list[str]] = {
     "policy-card.md": [RUN, "tests/api/test_cards.py::test_the_check_in_the_documents_finds_a_changed_card"],
     "pose-styles.md": [RUN, RUN, HERE + "test_the_statements_of_the_pages_are_accepted"],
     "recordings.md": [
+        MEASURED,
         "tests/test_recordings_page.py::test_the_samples_are_understood_as_the_page_shows",
         HERE + "test_the_statements_of_the_pages_are_accepted",
     ],

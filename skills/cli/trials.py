@@ -1,7 +1,7 @@
 """Commands of the JIGSAWS data set: its trials as recordings, and an evaluation of the proposed hand-offs."""
 
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -11,7 +11,7 @@ import typer
 from skills.cli.commands import command
 from skills.cli.completion import complete_sutures
 from skills.cli.connecting import service
-from skills.cli.output import Answer, err, show_table, table, warn
+from skills.cli.output import Answer, err, say, show_table, table, warn
 from skills.errors import SkillsError
 from skills.remedies import Door
 
@@ -21,6 +21,8 @@ commands = typer.Typer()
 jigsaws = typer.Typer(no_args_is_help=True, help="The JIGSAWS data set, which its authors provide on request.")
 commands.add_typer(jigsaws, name="jigsaws")
 
+Folder = Annotated[Path, typer.Argument(file_okay=False)]
+Primitives = Annotated[Path | None, typer.Option(exists=True, file_okay=False)]
 Tasks = Annotated[list[str] | None, typer.Option("--task", help="Only this task, such as Suturing; repeatable.")]
 
 
@@ -31,18 +33,20 @@ def jigsaws_add(
     suture: Annotated[str | None, typer.Option(autocompletion=complete_sutures)] = None,
     arm: Literal["PSM_left", "PSM_right"] | None = None,
     prefix: str = "jigsaws",
+    primitives: Primitives = None,
 ) -> Answer:
     """Store every trial of a folder; exit code 1 if one was refused, while the others are stored.
 
     Args:
-        folder: A folder with TASK/kinematics/AllGestures/*.txt, their transcriptions and meta files.
+        folder: A folder with TASK/kinematics/AllGestures/*.txt, their transcriptions, motion primitives and meta files.
         suture: Make a demonstration of this suture type from each proposed hand-off.
         arm: Only this arm.
         prefix: Prefix of the pseudonyms, before the surgeon's letter.
+        primitives: Folder of the motion primitives, such as those of COMPASS; TASK/motion_primitives by default.
     """
     from skills.samples import find_trials, send_trials
 
-    found = find_trials(folder, task or ())
+    found = find_trials(folder, task or (), primitives)
     with service() as client:
         worded = partial(SkillsError.words, door=Door.COMMAND)
         sending = send_trials(client, found, suture=suture, arm=arm, prefix=prefix, worded=worded)
@@ -52,24 +56,28 @@ def jigsaws_add(
         rows = [asdict(one) | {"recording": (one.recording or "")[:12], "demos": len(one.demos)} for one in done]
         show_table(rows, ("trial", "surgeon", "skill_level", "score", "recording", "proposed", "demos"))
         warn(*(f"{one.trial}: {problem}" for one in done for problem in one.problems))
+        say(*(f"{one.trial}, left out: {part}" for one in done for part in one.left_out))
 
     return Answer([asdict(one) for one in done], show, exit_code=1 if any(one.problems for one in done) else 0)
 
 
 @command(jigsaws, "evaluate")
-def jigsaws_evaluate(folder: Annotated[Path, typer.Argument(file_okay=False)], task: Tasks = None) -> Answer:
-    """Compare the hand-offs proposed from both hands' motion with the transcribed ones; nothing is stored.
+def jigsaws_evaluate(folder: Folder, task: Tasks = None, primitives: Primitives = None) -> Answer:
+    """Compare what is proposed from both hands' motion with transcriptions and motion primitives; nothing is stored.
+
+    Hand-offs are compared with transcribed gestures, transfers from hand to hand with the changes of hands in motion
+    primitives, beside the rule that every opening of a jaw is one.
 
     Args:
         folder: A folder with TASK/kinematics/AllGestures/*.txt.
+        primitives: Folder of the motion primitives, such as those of COMPASS; TASK/motion_primitives by default.
     """
-    from skills.samples import evaluate_hand_offs, find_trials
+    from skills.samples import NO_LABELS, Evaluated, evaluate_hand_offs, find_trials
 
-    found = find_trials(folder, task or ())
+    found = find_trials(folder, task or (), primitives)
     rows = evaluate_hand_offs(_tracked(found, "reading", len(found)))
-    columns = ("task", "trials", "left_out", "proposed", "a_trial", "transcribed", "precision", "recall", "brier")
-    shown = [{**asdict(row), "a_trial": round(row.a_trial, 1)} for row in rows]
-    return table([asdict(row) for row in rows], columns, rows=shown)
+    why = (f"{row.task}: {NO_LABELS}" for row in rows if row.labels is None)
+    return table([asdict(row) for row in rows], [one.name for one in fields(Evaluated)], *why)
 
 
 def _tracked(items: Iterable[T], doing: str, total: int) -> Iterable[T]:

@@ -16,10 +16,14 @@ closed, and stays closed while the giver's opens. Between the two both hold one 
 tips keep their distance: a grip elsewhere, on tissue or on nothing, does not bind them. Before its jaw closes again the
 giver moves away: one that stays has only taken a new grip. And in one recording all transfers are made at about the
 same distance between the tips, which need not be the true one: the frames of the two arms may be registered badly, or
-not at all, and then only the lengths of their movements are compared.
+not at all, and then only the lengths of their movements are compared. The longer the giver has held and the taker
+keeps, the likelier it is a transfer and no reach or regrip. The needle has left the giver's jaw, which opens before,
+when the tips have moved against each other.
 
 The confidence is the logistic function of a sum over these observations. Its weights were fitted to synthetic
-sessions with known transfers (`tests/demonstration/test_partner.py`), and not to surgeons. All of this is ours.
+sessions with known transfers (`tests/demonstration/test_partner.py`), beside an arm that stays and tips that slide past
+each other, and not to surgeons; the terms, the limits in seconds, `LIKELY` and `FREE_MM` were chosen with the motion
+primitives of real trials at hand (docs/recordings.md). All of this is ours.
 """
 
 from collections.abc import Mapping, Sequence
@@ -242,17 +246,20 @@ EXTREME = 0.02  # quantiles at the ends of the range, so that one value far outs
 REGRIP_S = 0.3  # a shorter opening of the jaw is a new grip, not a release
 HOLD_S = 0.4  # the giver's jaw was closed at least so long before the taker's, and the taker's stays closed so long
 BOTH_S = 5.0  # longest time in which both hold the needle
-LATE_S = 0.15  # the taker's jaw may close so much later: it holds before it is counted as closed
-LOOKS = 20  # samples of the time in which both hold, and of the time after it
+LATE_S = 0.2  # the taker's jaw may close so much later: it holds before it is counted as closed
+LONG_S = 4.0  # longer holds, of the giver before and of the taker after, prove no more
+LOOKS = 20  # samples of the time in which both hold
 AFTER_S = 3.0  # time after the release in which the giver moves away
+AFTER_LOOKS = 91  # samples of it, thirty per second as in JIGSAWS
+FREE_MM = 5.0  # the needle has left the giver when the tips have moved so far against each other since its jaw opened
 PARTED_MM = 15.0  # further away proves no more
 CLEAR_SLIP_MM, CLEAR_PARTED_MM = 2.0, 8.0  # of the transfers that show the usual distance
 
-# Weights of the confidence, see above: of a constant, of each mm of slip, of each mm that the giver moves away, and of
-# each mm between the distance and the usual one. Fitted, then the last one almost halved: real transfers vary more.
-WEIGHTS = (-0.8, -1.1, 0.7, -0.6)
-WITHOUT_FRAME = (-3.4, -0.3, 0.4, 0.0)  # if the poses of the two arms share no frame
-LIKELY = 0.5
+# Weights of the confidence, see above: of a constant, of each mm of slip, of each mm that the giver moves away, of each
+# mm between the distance and the usual one, and of each second for which the giver and the taker hold.
+WEIGHTS = (-13.7, -0.65, 0.77, -0.41, 2.5, 0.52)
+WITHOUT_FRAME = (-19.5, -0.48, 0.47, 0.0, 3.4, 1.2)  # if the poses of the two arms share no frame
+LIKELY = 0.3  # below a half: a wrong proposal is rejected in a moment, and a missing one has to be cut by hand
 ODDS = 30.0  # beyond these the exponential is of no use
 
 
@@ -266,6 +273,7 @@ class NeedleTransfer:
         held_s: The giver's jaw closed.
         taken_s: The taker's jaw closes.
         released_s: The giver's jaw opens.
+        freed_s: The needle has left the giver's jaw: the tips have parted by `FREE_MM`.
         slip_mm: Change of the distance between the two tips while both hold.
         confidence: Probability that it is one, 0 to 1.
     """
@@ -275,6 +283,7 @@ class NeedleTransfer:
     held_s: float
     taken_s: float
     released_s: float
+    freed_s: float
     slip_mm: float
     confidence: float
 
@@ -340,12 +349,14 @@ class _Overlap:
     held_s: float
     taken_s: float
     released_s: float
-    until_s: float  # the giver's jaw closes again, or the taker's opens
+    again_s: float  # the giver's jaw closes again
+    keeps_s: float  # the taker's jaw opens
 
 
 @dataclass(frozen=True)
 class _Observed:
     overlap: _Overlap
+    freed_s: float
     slip_mm: float
     parted_mm: float
     apart_mm: float | None
@@ -357,11 +368,13 @@ class _Observed:
     def judged(self, usual_mm: float | None) -> NeedleTransfer:
         one = self.overlap
         deviation_mm = 0.0 if self.apart_mm is None or usual_mm is None else abs(self.apart_mm - usual_mm)
-        seen = (1.0, self.slip_mm, min(self.parted_mm, PARTED_MM), deviation_mm)
+        holds_s = min(one.taken_s - one.held_s, LONG_S), min(one.keeps_s - one.released_s, LONG_S)
+        seen = (1.0, self.slip_mm, min(self.parted_mm, PARTED_MM), deviation_mm, *holds_s)
         weights = WITHOUT_FRAME if self.apart_mm is None else WEIGHTS
         odds = sum(weight * value for weight, value in zip(weights, seen, strict=True))
         confidence = 1.0 / (1.0 + exp(-max(odds, -ODDS)))
-        return NeedleTransfer(one.giver, one.taker, one.held_s, one.taken_s, one.released_s, self.slip_mm, confidence)
+        spans_s = one.held_s, one.taken_s, one.released_s, self.freed_s
+        return NeedleTransfer(one.giver, one.taker, *spans_s, self.slip_mm, confidence)
 
 
 def _overlaps(giver: str, taker: str, holds: Sequence[Span], grips: Sequence[Span]) -> list[_Overlap]:
@@ -373,25 +386,31 @@ def _overlaps(giver: str, taker: str, holds: Sequence[Span], grips: Sequence[Spa
         first, last = np.searchsorted(starts, (max(held_s + HOLD_S, released_s - BOTH_S), released_s + LATE_S))
         for taken_s, until_s in grips[first:last]:
             if until_s > released_s + HOLD_S:
-                found.append(_Overlap(giver, taker, held_s, taken_s, released_s, min(again_s, until_s)))
+                found.append(_Overlap(giver, taker, held_s, taken_s, released_s, again_s, until_s))
     return found
 
 
 def _observed(recording: Recording, one: _Overlap, bases: Sequence[BaseFrame]) -> _Observed:
     """Observe the two tips while both arms hold, and after the release."""
-    both_s = np.linspace(min(one.taken_s, one.released_s), max(one.taken_s, one.released_s), LOOKS)
-    after_s = np.linspace(one.released_s, min(one.until_s, one.released_s + AFTER_S), LOOKS)
     giver, taker = (recording.motion_of(arm=arm) for arm in (one.giver, one.taker))
+    here_s, there_s = recording.seconds(giver.stamps_ns), recording.seconds(taker.stamps_ns)
+    last_s = max(one.released_s, min(one.again_s, one.keeps_s, one.released_s + AFTER_S, here_s[-1], there_s[-1]))
+    both_s = np.linspace(min(one.taken_s, one.released_s), max(one.taken_s, one.released_s), LOOKS)
+    after_s = np.linspace(one.released_s, last_s, AFTER_LOOKS)
     seconds = np.concatenate([both_s, after_s])
-    here_mm = interpolated(seconds, recording.seconds(giver.stamps_ns), giver.tip_mm)
-    parted_mm = float(np.linalg.norm(here_mm[LOOKS:] - here_mm[LOOKS], axis=1).max())
-    other = partner_along(recording, giver, both_s, bases, one.taker)
+    here_mm = interpolated(seconds, here_s, giver.tip_mm)
+    other = partner_along(recording, giver, seconds, bases, one.taker)
     if other is not None:
-        apart_mm = np.linalg.norm(other.tip_mm - here_mm[:LOOKS], axis=1)
-        return _Observed(one, float(np.ptp(apart_mm)), parted_mm, float(apart_mm.mean()))
-    there_mm = interpolated(both_s, recording.seconds(taker.stamps_ns), taker.tip_mm)
-    ways_mm = [np.linalg.norm(tip_mm - tip_mm[0], axis=1) for tip_mm in (here_mm[:LOOKS], there_mm)]
-    return _Observed(one, float(np.abs(ways_mm[0] - ways_mm[1]).max()), parted_mm, None)
+        between_mm = here_mm - other.tip_mm
+        apart_mm = np.linalg.norm(between_mm[:LOOKS], axis=1)
+        slip_mm, usual_mm = float(np.ptp(apart_mm)), float(apart_mm.mean())
+    else:
+        between_mm, there_mm = here_mm, interpolated(both_s, there_s, taker.tip_mm)
+        ways_mm = [np.linalg.norm(tip_mm - tip_mm[0], axis=1) for tip_mm in (here_mm[:LOOKS], there_mm)]
+        slip_mm, usual_mm = float(np.abs(ways_mm[0] - ways_mm[1]).max()), None
+    parted_mm, free_mm = (np.linalg.norm(way[LOOKS:] - way[LOOKS], axis=1) for way in (here_mm, between_mm))
+    free = np.append(np.flatnonzero(free_mm > FREE_MM), AFTER_LOOKS - 1)[0]
+    return _Observed(one, float(after_s[free]), slip_mm, float(parted_mm.max()), usual_mm)
 
 
 def _usual_mm(seen: Sequence[_Observed]) -> float | None:

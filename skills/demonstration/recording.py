@@ -251,11 +251,12 @@ Integrity = Literal["full", "partial", "none"]
 class Label:
     """A named interval, both ends included, in the recording's own nanoseconds.
 
-    `kind` is "stage" (of a session, from a recorder's tags) or "gesture" (of JIGSAWS, such as "G6").
+    `kind` is "stage" (of a session, from a recorder's tags), "gesture" (of JIGSAWS, such as "G6") or "primitive" (a
+    motion primitive of COMPASS, such as "Grasp(L, Needle)").
     """
 
     name: str
-    kind: Literal["stage", "gesture"]
+    kind: Literal["stage", "gesture", "primitive"]
     start_ns: int
     end_ns: int
 

@@ -42,7 +42,7 @@ FILES = 1000
 METADATA = "metadata.yaml"
 METADATA_CHARACTERS = 1 << 20  # that of 60 topics with their QoS has 60,000
 METADATA_PARTS, METADATA_DEPTH = 100_000, 20  # events of the parser; of 60 topics at most 6000, in a depth of 9
-TEXTS = 10  # for one trial: its kinematics, a transcription, the meta files, a README
+TEXTS = 10  # for one trial: its kinematics, a transcription, its motion primitives, the meta files, a README
 UNZSTD_BYTES = 4 << 30
 SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".bag")
 LOGS = ("-wal", "-journal")  # of a database that was not closed, beside it
@@ -80,12 +80,14 @@ def read_zip(file: BinaryIO, frame: str | None = None) -> Recording:
         return _read_bag(archive, names, bag)
     if (root := root_of(names)) is not None:
         return read_episode(archive, root, frame)
-    texts = [name for name in names if name.lower().endswith(".txt")]
+    tables = [name for name in names if name.lower().endswith(".csv")]
+    named = [name for name in tables if archive.text(name, errors="replace").startswith(jigsaws.HEADER)]
+    texts = named + [name for name in names if name.lower().endswith(".txt")]
     if texts:
         return _read_trial(archive, texts)
     raise UnknownFormat(
         "The archive has no bag (.mcap, .mcap.zstd, .db3 or .bag), no LeRobot dataset (meta/info.json) and no JIGSAWS "
-        "kinematics (.txt)."
+        "kinematics (.txt, or .csv below a line of names)."
     )
 
 
@@ -295,13 +297,14 @@ def _read_trial(archive: Archive, names: list[str]) -> Recording:
     texts = {name: archive.text(name) for name in names}
     kinematics = [name for name, text in texts.items() if jigsaws.looks_like_kinematics(text.split("\n", 1)[0])]
     transcriptions = [name for name, text in texts.items() if jigsaws.is_transcription(text)]
-    if len(kinematics) != 1 or len(transcriptions) > 1:
+    primitives = [name for name, text in texts.items() if jigsaws.is_primitives(text)]
+    if len(kinematics) != 1 or len(transcriptions) > 1 or len(primitives) > 1:
         raise UnreadableRecording(
-            f"The archive has {len(kinematics)} texts with JIGSAWS kinematics and {len(transcriptions)} "
-            "transcriptions; send one trial with its transcription at a time.",
+            f"The archive has {len(kinematics)} texts with JIGSAWS kinematics, {len(transcriptions)} transcriptions "
+            f"and {len(primitives)} with motion primitives; send one trial with its transcription at a time.",
             kinematics=len(kinematics),
         )
     trial = PurePosixPath(kinematics[0]).stem
     rated = next((found for text in texts.values() if (found := jigsaws.read_meta(text).get(trial))), None)
     with archive.unpacked(kinematics[0]) as file:
-        return jigsaws.read_jigsaws(file, "".join(texts[name] for name in transcriptions), rated)
+        return jigsaws.read_jigsaws(file, *(texts[name] for name in transcriptions + primitives), rated=rated)

@@ -13,8 +13,11 @@ A trial in which the masters move as the other way round is refused.
 A public copy has the same numbers as comma-separated text below a line of names, which calls columns 39-57
 `SLAVE_LEFT`.
 
-A transcription has one gesture per line, `start end G6`, in frames counted from 1, both inclusive. A meta file has one
-trial per line: its name, the surgeon's self-reported skill (N, I or E), the global rating score and its six parts.
+A transcription has one gesture per line, `start end G6`, in frames counted from 1, both inclusive. Motion primitives,
+as COMPASS labels them from the videos, stand below the line `Start Stop Motion Primitive`, one or more per line,
+`start end Grasp(L, Needle) Release(R, Needle)`, in frames counted from 0, both inclusive; L and R are the instruments
+by side in the video, `PSM_left` and `PSM_right` here. COMPASS calls Suturing_B001 `Suturing_S02_T01`. A meta file has
+one trial per line: its name, the surgeon's self-reported skill (N, I or E), the global rating score and its six parts.
 
 The data set does not specify the frame of the poses, only that it is the same for both sides; it is called "jigsaws"
 here. It is not the base of an arm, so it cannot be determined whether an arm can reach a pose. The instruments are
@@ -35,6 +38,7 @@ from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Label, Motion, Recording, Topic, recorded_motion, recorded_signal
 from skills.errors import NotAQuaternion, NotFinite, UnreadableRecording
 from skills.formats.cells import is_number
+from skills.formats.tags import in_time
 from skills.kinematics import nearest_quaternions
 from skills.scoring.calibration import PARTS
 
@@ -59,6 +63,8 @@ HEADER = ",".join(
     f"{side}_{part}" for side in ("MASTER_LEFT", "MASTER_RIGHT", "SLAVE_LEFT", "SLAVE_RIGHT") for part in _PARTS
 )
 _GESTURE = re.compile(r"\s*(\d{1,7})\s+(\d{1,7})\s+(G\d{1,2})\s*")
+_PRIMITIVES = re.compile(r"\s*(\d{1,7})\s+(\d{1,7})\s+((?:[A-Z][a-z]+\(\w+, [\w/]+\)\s*)+)")
+_TRIAL_OF_COMPASS = re.compile(r"([A-Za-z_]+)_S(0[1-9]|1\d|2[0-6])_T(\d{2})")
 _TRIAL = re.compile(r"(?P<task>[A-Za-z_]+)_(?P<user>[A-Z])(?P<number>\d{3})")
 
 
@@ -91,6 +97,7 @@ class Trial:
         kinematics: The file with its motion.
         meta: The file with the ratings of its task, which may be missing.
         transcription: The file with its gestures, None where there is none.
+        primitives: The file with its motion primitives, None likewise.
         rated: Its ratings in the task's meta file, None where there are none.
     """
 
@@ -101,6 +108,7 @@ class Trial:
     kinematics: Path
     meta: Path
     transcription: Path | None
+    primitives: Path | None
     rated: RatedTrial | None
 
 
@@ -109,19 +117,20 @@ def looks_like_kinematics(first_line: str) -> bool:
     return first_line.strip() == HEADER or ("," not in first_line and len(first_line.split()) == COLUMNS)
 
 
-def read_jigsaws(file: BinaryIO, transcription: str = "", rated: RatedTrial | None = None) -> Recording:
+def read_jigsaws(file: BinaryIO, *labels: str, rated: RatedTrial | None = None) -> Recording:
     """Read a trial.
 
     Args:
         file: The kinematics, at their beginning.
-        transcription: The text of its transcription.
+        *labels: The texts of its transcription and of its motion primitives.
         rated: Its ratings, which are stored in the notes.
 
     Returns:
         The recording, in millimetres, in the frame "jigsaws".
 
     Raises:
-        UnreadableRecording: A row without 76 numbers, a gesture outside the trial, or instruments that are exchanged.
+        UnreadableRecording: A row without 76 numbers, a gesture or primitive outside the trial, or instruments that are
+            exchanged.
         NotFinite: NaN or infinity.
         NotAQuaternion: A matrix that is not a rotation.
         NotMetres: As in `skills.demonstration.recording`.
@@ -139,7 +148,7 @@ def read_jigsaws(file: BinaryIO, transcription: str = "", rated: RatedTrial | No
         jaws=tuple((arm, signal) for arm, signal in grippers.items() if arm.startswith("PSM")),
         grippers=tuple((arm, signal) for arm, signal in grippers.items() if arm.startswith("MTM")),
         topics=tuple(Topic(_columns(first), "jigsaws", len(table)) for first in sorted(_ARMS.values())),
-        labels=_gestures(transcription, stamps_ns),
+        labels=in_time(label for text in labels for label in _labels(text, stamps_ns)),
         notes=() if rated is None else _notes(rated),
     )
 
@@ -166,17 +175,27 @@ def is_transcription(text: str) -> bool:
     return _GESTURE.fullmatch(text.lstrip().split("\n", 1)[0]) is not None
 
 
-def trials(folder: Path) -> Iterator[Trial]:
+def is_primitives(text: str) -> bool:
+    """Return whether a text starts with the first line of motion primitives."""
+    return text.split("\n", 1)[0].split() == ["Start", "Stop", "Motion", "Primitive"]
+
+
+def trials(folder: Path, primitives: Path | None = None) -> Iterator[Trial]:
     """Yield the trials in a folder of the data set, or of one of its tasks, sorted by path.
 
     A trial of the comma-separated copy is omitted where the folder has it in the data set's own form too.
+
+    Args:
+        folder: The folder.
+        primitives: A folder with motion primitives, at any depth; by default they are in folders of `folder` that are
+            named `motion_primitives`, with any ending but those of COMPASS for a single hand, `_L` and `_R`.
     """
+    labelled = _primitives_in(primitives or folder, "**/*.txt" if primitives else "motion_primitives*/**/*.txt")
     found = sorted(folder.rglob("kinematics/AllGestures/*.txt"))
     names = {path.stem for path in found}
     found += sorted(path for path in folder.rglob("processed/*/*.csv") if path.stem not in names)
     for kinematics in found:
-        named = _TRIAL.fullmatch(kinematics.stem)
-        if named is None:
+        if (named := _TRIAL.fullmatch(kinematics.stem)) is None:
             continue
         home, task = kinematics.parents[2], named["task"]
         places = (home / f"meta_file_{task}.txt", home / "trial_results" / f"meta_file_{task}.txt")
@@ -191,8 +210,19 @@ def trials(folder: Path) -> Iterator[Trial]:
             kinematics=kinematics,
             meta=meta,
             transcription=transcription if transcription.is_file() else None,
+            primitives=labelled.get(kinematics.stem),
             rated=rated.get(kinematics.stem),
         )
+
+
+def _primitives_in(folder: Path, pattern: str) -> dict[str, Path]:
+    """Return the files of motion primitives by the names that JIGSAWS gives to their trials."""
+    found = {}
+    for path in sorted(folder.rglob(pattern)):
+        if not path.parent.name.endswith(("_L", "_R")) and is_primitives(path.read_text(errors="replace")):
+            of = _TRIAL_OF_COMPASS.fullmatch(path.stem)
+            found[f"{of[1]}_{chr(ord('A') + int(of[2]) - 1)}{int(of[3]):03}" if of else path.stem] = path
+    return found
 
 
 def _table(file: BinaryIO) -> Floats:
@@ -289,22 +319,25 @@ def _quaternions(arm: str, matrices: Floats) -> Floats:
     return nearest_quaternions(matrices)
 
 
-def _gestures(transcription: str, stamps_ns: Ints) -> tuple[Label, ...]:
-    labels: list[Label] = []
-    for number, line in enumerate(transcription.splitlines(), start=1):
-        if not line.strip():
+def _labels(text: str, stamps_ns: Ints) -> Iterator[Label]:
+    """Yield the gestures of a transcription, or motion primitives."""
+    kind: Literal["primitive", "gesture"] = "primitive" if is_primitives(text) else "gesture"
+    form, first, example = (_PRIMITIVES, 0, "Grasp(L, Needle)") if kind == "primitive" else (_GESTURE, 1, "G6")
+    lines = text.splitlines()
+    if len(lines) > GESTURES:
+        raise UnreadableRecording(f"The {kind}s of the trial have more than {GESTURES} lines.")
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or is_primitives(line):
             continue
-        if len(labels) == GESTURES:
-            raise UnreadableRecording(f"The transcription has more than {GESTURES} gestures.")
-        found = _GESTURE.fullmatch(line)
-        start, end = (int(found[1]), int(found[2])) if found else (0, 0)
-        if found is None or not 1 <= start <= end <= len(stamps_ns):
+        found = form.fullmatch(line)
+        start, end = (int(found[1]) - first, int(found[2]) - first) if found else (-1, -1)
+        if found is None or not 0 <= start <= end < len(stamps_ns):
             raise UnreadableRecording(
-                f"Line {number} of the transcription is not a gesture of this trial; `start end G6` is expected, "
-                f"in frames from 1 to {len(stamps_ns)}."
+                f"Line {number} of the {kind}s is not one of this trial; `start end {example}` is expected, in frames "
+                f"from {first} to {len(stamps_ns) - 1 + first}."
             )
-        labels.append(Label(found[3], "gesture", int(stamps_ns[start - 1]), int(stamps_ns[end - 1])))
-    return tuple(sorted(labels, key=lambda label: label.start_ns))
+        for name in re.split(r"(?<=\))\s+", found[3].strip()):
+            yield Label(name, kind, int(stamps_ns[start]), int(stamps_ns[end]))
 
 
 def _notes(rated: RatedTrial) -> tuple[tuple[str, str], ...]:

@@ -16,6 +16,7 @@ import numpy as np
 from skills import packing
 from skills.demonstration.identification import ArmIdentification
 from skills.demonstration.movement import press_times
+from skills.demonstration.plausible import check_steps
 from skills.demonstration.recording import (
     BaseFrame,
     Joints,
@@ -27,6 +28,7 @@ from skills.demonstration.recording import (
     equal_samples,
 )
 from skills.demonstration.segments import Segment, propose_by_arm
+from skills.errors import ImplausibleMotion
 from skills.fields import as_json
 from skills.formats import read_recording
 from skills.schemas import recordings as described
@@ -82,7 +84,7 @@ def describe(recording: Recording, proposed: Sequence[Segment]) -> described.Rec
     """
     return described.RecordingContent(
         duration_s=recording.duration_s,
-        notes=dict(recording.notes),
+        notes=dict(recording.notes) | _jumps(recording),
         topics=list(recording.topics),
         motions=[
             described.Motion(m.arm, m.topic, m.frame, len(m.stamps_ns), m.duplicate_stamps) for m in recording.motions
@@ -136,6 +138,17 @@ def _quality(motion: Motion) -> described.Quality:
         extent_mm=(x, y, z),
         equal_samples=equal_samples(motion.tip_mm, motion.rotation_xyzw),
     )
+
+
+def _jumps(recording: Recording) -> dict[str, str]:
+    """Return the motions that can only be cut in parts, with the refusal of the whole."""
+    found = {}
+    for one in recording.motions:
+        try:
+            check_steps(one.topic, recording.seconds(one.stamps_ns), one.tip_mm)
+        except ImplausibleMotion as error:
+            found[f"jump of {one.topic}"] = str(error)
+    return found
 
 
 def _label(recording: Recording, label: Label) -> described.Label:

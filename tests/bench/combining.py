@@ -3,9 +3,14 @@
 Two sets: the cohort of known truth, with tempo and tremor, and the sample recordings' surgeons, each of whose hand-offs
 is repeated with day-to-day differences; and the five hand-offs of one sample unchanged. With an outlier, one of the
 combined demonstrations, the newest as likely as any other, is a hand-off of a quite different shape.
+
+And real surgeons: with `SKILLS_TEST_JIGSAWS`, every hand-off that is proposed in a trial of two tasks is left out, and
+five of the surgeon's other trials, of the same instrument, are combined. The rivals are the straight line from start to
+goal, and the corridor of five hand-offs of other surgeons.
 """
 
 import io
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -19,6 +24,7 @@ from skills.formats import read_recording
 from skills.gridworld.grid import choose_grid, discretize
 from skills.learning.evaluation import dtw
 from skills.seeds.recordings import sample_recordings
+from tests.bench.recognition import by_task
 from tests.comparison.cohort import HUMPS, cohort, demo_of
 
 FIRST_SEED = 1000  # none of the seeds on which `AGREEING` was chosen
@@ -27,6 +33,8 @@ OUTLIER_MM = 15.0  # size of an outlier's humps; a surgeon's own are 5 mm
 RESAMPLES = 2000
 NEWEST = "newest alone"
 METHODS = [NEWEST, *COMBININGS]
+RIVALS = ["corridor of other surgeons", "straight line"]
+COMBINED = 5  # hand-offs
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +65,39 @@ def combining(table: Table) -> None:
                 ways, grids = errors.of(method)
                 gained = "" if method == NEWEST else f"; gained {interval(errors.of(NEWEST)[0] - ways)}"
                 table.add_row(f"  {method}", interval(ways), interval(grids) + gained)
+    for name, (count, rows) in of_real_surgeons().items() if os.environ.get("SKILLS_TEST_JIGSAWS") else ():
+        table.add_row(f"[bold]{name}: {count} hand-offs of {len(rows)} surgeons", "mm at a state", "less than straight")
+        for k, method in enumerate(METHODS + RIVALS):
+            table.add_row(f"  {method}", interval(rows[:, k]), interval(rows[:, -1] - rows[:, k]))
+
+
+def of_real_surgeons() -> dict[str, tuple[int, np.ndarray]]:
+    """Return, by task and instrument, how many hand-offs were left out, and each surgeon's mean distances, (S, M)."""
+    rng, found = np.random.default_rng(FIRST_SEED), {}
+    for task, every in by_task().items():
+        for arm in sorted({one.arm for one in every}):
+            some, means, count = [one for one in every if one.arm == arm], [], 0
+            for user in sorted({one.user for one in some}):
+                errors = []
+                for held in (one for one in some if one.user == user):
+                    own = [one.demo for one in some if one.user == user and one.trial != held.trial]
+                    others = [one.demo for one in some if one.user != user]
+                    if len(own) < COMBINED:
+                        continue
+                    mine, theirs = ([pool[k] for k in drawn(rng, len(pool))] for pool in (own, others))
+                    wanted, ways = _paths(held.demo, mine)
+                    ways.append(_paths(held.demo, theirs)[1][METHODS.index("corridor")])
+                    ways.append(np.linspace(*wanted[[0, -1]], len(wanted)))
+                    errors.append([_apart(way, wanted) for way in ways])
+                count += len(errors)
+                means += [np.mean(errors, axis=0)] if errors else []
+            found[f"{task}, {arm}"] = count, np.array(means)
+    return found
+
+
+def drawn(rng: np.random.Generator, count: int) -> list[int]:
+    """Draw some of these, in their order."""
+    return sorted(rng.choice(count, COMBINED, replace=False).tolist())
 
 
 def leave_one_out(surgeons: list[list[Demo]], outlier: bool) -> Errors:
@@ -79,12 +120,18 @@ def _left_out(demos: list[Demo], outlier: bool, rng: np.random.Generator) -> Ite
 
 def _distances(held: Demo, rest: list[Demo]) -> list[tuple[float, float]]:
     """Measure each method's path, and its grid path, against the left-out demonstration, aligned with it: (M, 2)."""
+    wanted, ways = _paths(held, rest)
+    grids = [discretize(way, choose_grid(way, "fit")).tip_mm for way in ways]
+    return [(_apart(way, wanted), _apart(grid, wanted)) for way, grid in zip(ways, grids, strict=True)]
+
+
+def _paths(held: Demo, rest: list[Demo]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the left-out demonstration, and each method's path between its start and goal."""
     (wanted, *_, newest), moved = side_by_side([held, *rest], 0)
     ways = [newest, *(combine(rest, how).tip_mm for how in COMBININGS)]
     if moved:
         ways = [laid(placed(way, scaled=True), *wanted[[0, -1]]) for way in ways]
-    grids = [discretize(way, choose_grid(way, "fit")).tip_mm for way in ways]
-    return [(_apart(way, wanted), _apart(grid, wanted)) for way, grid in zip(ways, grids, strict=True)]
+    return wanted, ways
 
 
 def _apart(way_mm: np.ndarray, wanted_mm: np.ndarray) -> float:

@@ -181,13 +181,14 @@ RATES = {
     "lerobot": (30,),
 }
 KINDS = tuple(RATES)
+QUANTITIES = ("time", "length", "angle")
 
 
 def case(rng: np.random.Generator, kind: str, *, is_sound: bool = False) -> tuple[str, HandOff, Callable[[], Written]]:
     """Draw a hand-off, what is scaled of it and by how much, and the way to write it."""
     rate = float(rng.choice(RATES[kind]))
     one = draw(rng, rate, base=kind == "joints" or rng.random() < 0.6)
-    what = str(rng.choice(["time", "angle"] if kind == "joints" else ["time", "length", "angle"]))
+    what = str(rng.choice(["time", "angle"] if kind == "joints" else QUANTITIES))
     length = str(rng.choice(["m", "mm"] if kind == "table" else ["m"]))
     turn = str(rng.choice(["rad", "deg"] if kind in ("table", "joints") else ["rad"]))
     if what == "time":

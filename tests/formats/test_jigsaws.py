@@ -5,7 +5,15 @@ import pytest
 
 from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.recording import Label
-from skills.errors import BadSettings, MixedFrames, NotAQuaternion, NotFinite, NotMetres, UnreadableRecording
+from skills.errors import (
+    BadSettings,
+    MixedFrames,
+    NotAQuaternion,
+    NotFinite,
+    NotMetres,
+    UnknownFormat,
+    UnreadableRecording,
+)
 from skills.formats import read_recording
 from skills.formats.jigsaws import HEADER, RATE_HZ, RatedTrial, meta_line, read_meta, trials
 from tests.formats.others import zipped
@@ -116,6 +124,62 @@ def test_gestures_become_labels_of_the_frames_they_name():
     assert [label.name for label in labels] == ["G1", "G6", "G4", "G11"]
     stamps = read(data).motion_of(arm="PSM_left").stamps_ns
     assert labels[1] == Label("G6", "gesture", int(stamps[60]), int(stamps[149]))
+
+
+PRIMITIVES = (
+    "Start Stop Motion Primitive\n0 59 Grasp(L, Needle)\n60 89 Release(R, Needle) Push(Needle, Fabric/Tissue)\n"
+)
+
+
+def test_motion_primitives_become_labels_beside_gestures():
+    members = {"Suturing_B001.txt": text(kinematics()), "motion_primitives/Suturing_B001.txt": PRIMITIVES.encode()}
+    stamps = read(text(kinematics())).motion_of(arm="PSM_left").stamps_ns
+    labels = read(zipped(members)).labels
+    assert [(one.name, one.kind) for one in labels] == [
+        ("Grasp(L, Needle)", "primitive"),
+        ("Push(Needle, Fabric/Tissue)", "primitive"),
+        ("Release(R, Needle)", "primitive"),
+    ]
+    assert (labels[2].start_ns, labels[2].end_ns) == (stamps[60], stamps[89])
+    both = read(zipped(members | {"transcriptions/Suturing_B001.txt": GESTURES.encode()})).labels
+    assert set(labels) < set(both) and {one.name for one in both} >= {"G1", "G6"}
+
+
+@pytest.mark.parametrize("line", ["60 300 Grasp(L, Needle)", "60 50 Grasp(L, Needle)", "60 89 Grasp(L)", "60 89"])
+def test_a_line_that_is_no_primitive_of_the_trial_is_refused(line):
+    members = {"a.txt": text(kinematics()), "b.txt": (PRIMITIVES + "\n" + line).encode()}
+    with pytest.raises(UnreadableRecording, match=r"Line 5 of the primitives .* frames from 0 to 299\."):
+        read(zipped(members))
+
+
+def test_motion_primitives_are_found_under_the_names_of_compass(tmp_path):
+    root = folder(tmp_path / "data")
+    for inside, name in (
+        ("data/Suturing/motion_primitives_combined", "Suturing_S02_T01"),
+        ("data/Suturing/motion_primitives_L", "Suturing_S03_T02"),
+        ("elsewhere/deep", "Suturing_C002"),
+        ("elsewhere/deep", "Suturing_S27_T01"),
+    ):
+        (tmp_path / inside).mkdir(parents=True, exist_ok=True)
+        (tmp_path / inside / f"{name}.txt").write_text(PRIMITIVES)
+    (tmp_path / "elsewhere" / "Suturing_B001.txt").write_text("a note")
+    found = [one.primitives and one.primitives.stem for one in trials(root)]
+    assert found == ["Suturing_S02_T01", None]
+    assert [one.primitives and one.primitives.stem for one in trials(root, tmp_path / "elsewhere")] == [
+        None,
+        "Suturing_C002",
+    ]
+
+
+def test_a_zip_of_the_comma_separated_copy_is_read():
+    data = with_names(text(driven()))
+    members = {"processed/suturing/Suturing_B001.csv": data, "meta_file_Suturing.txt": META.encode()}
+    got = read(zipped(members))
+    np.testing.assert_array_equal(got.motions[0].tip_mm, read(data).motions[0].tip_mm)
+    assert dict(got.notes)["skill"] == "novice"
+    assert len(read(zipped({"Suturing_B001.CSV": data})).motions) == 2
+    with pytest.raises(UnknownFormat, match="no JIGSAWS kinematics"):
+        read(zipped({"table.csv": b"t_s,x_mm,y_mm,z_mm\n0,1,50,-120\n"}))
 
 
 def test_the_meta_file_says_how_the_trial_was_rated():

@@ -231,13 +231,17 @@ def test_a_single_pose_is_refused_in_words_where_it_is_cut():
 # ---- scaled files of every format ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [240, pytest.param(10_000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("count", [120, pytest.param(10_000, marks=pytest.mark.nightly)])
 def test_no_file_in_another_unit_is_taken_silently_and_wrongly(count):
     found = list(scalings.outcomes(count, seed=count))
+    scaled = {tuple(name.split(" x ")[0].split(", ")) for name, _ in found}
+    assert scaled == {
+        (k, what) for k in scalings.KINDS for what in scalings.QUANTITIES if (k, what) != ("joints", "length")
+    }
     assert [name for name, what in found if what == "wrong"] == []
     assert sum(what == "refused" for _, what in found) > 0.9 * count
 
 
-@pytest.mark.parametrize("count", [120, pytest.param(2000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("count", [60, pytest.param(2000, marks=pytest.mark.nightly)])
 def test_no_sound_file_is_refused(count):
     assert {what for _, what in scalings.outcomes(count, seed=1, are_sound=True)} == {"right"}

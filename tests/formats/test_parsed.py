@@ -56,6 +56,16 @@ def test_it_is_plain_json(recorded):
     assert json.loads(json.dumps(about, allow_nan=False)) == about
 
 
+def test_a_jump_is_named_before_anything_is_cut(recorded):
+    moved = recorded.motions[0]
+    tip_mm = moved.tip_mm.copy()
+    tip_mm[len(tip_mm) // 2 :] += 40.0
+    notes = parse(replace(recorded, motions=(replace(moved, tip_mm=tip_mm), *recorded.motions[1:]))).about.notes
+    assert list(notes) == ["surgeon", f"jump of {moved.topic}"]
+    assert "the tip jumps by 69.2 mm within" in notes[f"jump of {moved.topic}"]
+    assert list(parse(recorded).about.notes) == ["surgeon"]
+
+
 def test_a_recording_with_little_in_it_has_little_told():
     value, _ = session(Kind(seed=6, passes=1, jaw=False, clutch=False, both_arms=False, wrist=False))
     about = parse(value).about

@@ -35,6 +35,31 @@ def text(table: np.ndarray) -> bytes:
     return "".join(" ".join(f"{value: .6f}" for value in row) + " \n" for row in table).encode()
 
 
+def handing_over(opens_s: float, parts_s: float) -> np.ndarray:
+    """Return a trial in which the right instrument carries a needle, gives it to the left one, and goes away.
+
+    The left one closes 0.5 s before the right one opens, and opens at 8.5 s. The right one moves at 40 mm/s, also
+    for a fifth of a second before it is 5 mm away at `parts_s`.
+    """
+    table, t = kinematics(), np.arange(300) / RATE_HZ
+    moved = 0.02 * np.clip(t - 0.5, 0, 2) - 0.04 * np.clip(t - parts_s + 0.125, 0, 1)
+    for first, way, shut in ((38, moved, (t > 0.3) & (t < opens_s)), (57, 0.0 * t, (t > opens_s - 0.5) & (t < 8.5))):
+        table[:, (19 if first == 38 else 0) + np.arange(3)] = table[:, first : first + 3] = [0.02, 0.05, -0.10]
+        table[:, first] += way
+        table[:, 19 if first == 38 else 0] += way
+        table[:, first + 18] = np.where(shut, -0.5, 0.4)
+    return table
+
+
+def swaying() -> np.ndarray:
+    """Return a trial in which each arm sways by 1.8 mm about its place, with its gripper closed."""
+    table, t = kinematics(), np.arange(300) / RATE_HZ
+    for first in (0, 19, 38, 57):
+        table[:, first : first + 3] = [0.02, 0.05, -0.10]
+        table[:, first] += 0.0018 * np.sin(np.pi * np.clip(t - 2.5, 0, 4))
+    return table
+
+
 def folder(root: Path) -> Path:
     """Write two trials of two surgeons, their gestures and their meta file."""
     task = root / "Suturing"

@@ -278,11 +278,14 @@ def test_other_arms_that_are_not_those_of_the_demonstrations_are_refused() -> No
 
 @pytest.mark.nightly
 @pytest.mark.needs("jigsaws")
-def test_a_shortest_turn_is_not_certainly_nearer_to_other_surgeons() -> None:
+def test_a_shortest_turn_is_nearer_to_other_surgeons_by_a_few_degrees() -> None:
+    """What docs/pose-styles.md says against ours: surely nearer with all trials, by at most a tenth of the error."""
     for of in surgeons().values():
         mine, straight = left_out([one for _, one in of], (ours, line), drawn([user for user, _ in of]))
-        low, _ = interval((mine - straight)[:, 1])
-        assert low < 0.0
+        _, high = interval((mine - straight)[:, 1])
+        assert high < 0.1 * straight[:, 1].mean()
+        low, _ = interval((mine - straight)[:, 0])
+        assert low < 0.0, "in position it is not surely nearer"
 
 
 @pytest.mark.needs("benchmarks")

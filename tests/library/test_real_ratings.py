@@ -65,8 +65,9 @@ def test_a_user_is_refused_with_the_figures_and_nothing_is_stored(
     settings.cache_clear()
     said = result.stdout + result.stderr
     assert result.exit_code == 1, said
-    assert "without a kinematics file: Knot_Tying_G004" in said
-    assert "Needle_Passing_B005, Needle_Passing_F002" in said
+    assert "without a kinematics file" not in said
+    assert "Knot_Tying: 36 trials" in said and "Needle_Passing: 28 trials" in said
+    assert "Needle_Passing_B005, Needle_Passing_E002" in said
     for part in (
         "shorter trials first",
         "mean of the surgeon's other trials",
@@ -87,10 +88,12 @@ def test_the_figures_of_the_page_are_those_of_the_real_trials(jigsaws: Path) -> 
     found = calibrate_on(read_cohort(jigsaws))
     judged = found.model_dump()["validated"]
     knots, needles = (judged["tasks"][task] for task in TASKS)
-    assert knots["model"]["rho"] >= 0.65 and needles["model"]["rho"] >= 0.45  # the goals, stated before
-    for task in (knots, needles):
-        assert task["model"]["rho"] > max(task["rivals"][name]["rho"] for name in DURATIONS)
-    assert all(refusals(found.validated.tasks[task]) for task in TASKS)
+    assert knots["model"]["rho"] >= 0.65  # the goal, stated before; that of the needles was 0.45, and is missed
+    assert knots["model"]["rho"] > max(knots["rivals"][name]["rho"] for name in DURATIONS)
+    for task, is_by_chance in zip(TASKS, (False, True), strict=True):
+        reasons = " ".join(refusals(found.validated.tasks[task]))
+        assert "no better than the duration alone" in reasons
+        assert ("no better than by chance" in reasons) == is_by_chance
     for label, name in ROWS.items():
         cells = []
         for task in (knots, needles):
