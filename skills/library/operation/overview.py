@@ -7,15 +7,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from skills.db import newest
-from skills.db.models import (
-    Demonstration,
-    Plan,
-    StoredPictures,
-    StoredPlayback,
-    StoredRecording,
-    Surgeon,
-    SutureType,
-)
+from skills.db.models import Demonstration, Plan, StoredPictures, StoredPlayback, StoredRecording, Surgeon, SutureType
 from skills.db.service_tables import Job
 from skills.library.plans.playback_pictures import job_of_pictures
 

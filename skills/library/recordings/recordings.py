@@ -30,16 +30,7 @@ from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
-from skills.errors import (
-    BadInput,
-    Busy,
-    Conflict,
-    Corrupt,
-    SkillsError,
-    TooLarge,
-    UnknownFormat,
-    UnreadableRecording,
-)
+from skills.errors import BadInput, Busy, Conflict, Corrupt, SkillsError, TooLarge, UnknownFormat, UnreadableRecording
 from skills.formats import MEDIA_TYPES, media_type_of
 from skills.formats.parsed import ParsedContent, parse_recording
 from skills.formats.reader_process import ConfinedReader
@@ -415,14 +406,14 @@ def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes
     Raises:
         Corrupt: The digest differs; the last chunk is then withheld.
     """
-    seen, held = hashlib.sha256(), b""
+    hasher, held = hashlib.sha256(), b""
     for data in session.scalars(chunks_of(stored.row).execution_options(yield_per=1)):
         # One chunk behind, so that the last one is only yielded after the digest was verified.
         if held:
             yield held
-        seen.update(data)
+        hasher.update(data)
         held = data
-    if seen.hexdigest() != stored.sha256:
+    if hasher.hexdigest() != stored.sha256:
         raise damaged()
     yield held
 
