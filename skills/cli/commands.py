@@ -43,7 +43,7 @@ from typer.models import ArgumentInfo, OptionInfo
 
 from skills.cli.completion import complete_surgeons, complete_sutures
 from skills.cli.output import Answer, err, print_json
-from skills.errors import BadInput, SkillsError
+from skills.errors import BadInput, SkillsError, refuse_not_finite
 from skills.remedies import Door, did_you_mean
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def command(
                     values[keywords] = {
                         field: parse(value) for field, (parse, value) in given.items() if value not in (None, [])
                     }
-                _refuse_not_finite(values)
+                refuse_not_finite(values, lambda path: _flag(next(one for one in path if one not in flags)))
                 answer = function(**values)
                 if answer is not None:
                     _print(answer, as_json)
@@ -147,17 +147,9 @@ def command(
     return register
 
 
-def _refuse_not_finite(values: Mapping[str, Any]) -> None:
-    """Refuse nan and inf, which Python reads as numbers.
-
-    Raises:
-        BadInput: A value, or a field of keyword arguments, is or has such a number.
-    """
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            _refuse_not_finite(value)
-        elif isinstance(value, float) and not isfinite(value):
-            raise BadInput(f"--{OPTIONS.get(name, name).replace('_', '-')} {value}: every number must be finite.")
+def _flag(name: str) -> str:
+    """Return the option of a parameter."""
+    return f"--{OPTIONS.get(name, name).replace('_', '-')}"
 
 
 def _with_help(parameter: inspect.Parameter, helps: Mapping[str, str]) -> inspect.Parameter:

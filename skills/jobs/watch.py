@@ -92,6 +92,7 @@ ENDINGS = {
 # `workflows.perform_job` raises nothing itself. If a workflow ends with an error, or without an outcome in our row, the
 # engine's database or ours was unavailable. The job did not fail, so a new attempt is started.
 ENGINE_FAILED = ("ERROR", "SUCCESS")
+DATABASE_FAILED = ("OperationalError", "TimeoutError")  # SQLAlchemy's errors, by which the engine ends a workflow
 
 
 @dataclass
@@ -171,6 +172,11 @@ class Watch:
         sign_some_history(self.database, inf)
         with self.database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == self.executor))
+
+    def hand_back(self) -> None:
+        """Start a new attempt at each job that this worker holds: the jobs are not what ends it."""
+        for workflow in self._pending(self.executor):
+            self._start_over(workflow.workflow_id)
 
     def at_work(self, *queues: str) -> bool:
         """Return whether this worker still holds workflows of some queues, by default of any."""
@@ -264,14 +270,17 @@ class Watch:
         cancel(self.client, row, attempt)
 
     def _begin_again(self, row: int, attempt: int) -> None:
-        """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`."""
-        if attempt < ENGINE_ATTEMPTS:
+        """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`.
+
+        Those at which its database was busy or away are not counted.
+        """
+        ended = self.client.list_workflows(workflow_id_prefix=f"{row}-", status=[*ENGINE_FAILED], load_input=False)
+        failed = sum(getattr(one.error, "name", None) not in DATABASE_FAILED for one in ended)
+        if failed < ENGINE_ATTEMPTS:
             log.warning("The job engine failed in job %d at attempt %d; it is started again.", row, attempt)
             self._start_over(workflow_id(row, attempt))
         else:
-            reason = (
-                f"The job engine failed {attempt} times in this job; check the worker's log, then request it again."
-            )
+            reason = f"The job engine failed {failed} times in this job; check the worker's log, then request it again."
             fail(self.database, row, attempt, reason)
 
     def _note_submitted(self, rows: Sequence[int]) -> None:

@@ -162,6 +162,7 @@ def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
             log.error(
                 "The database was unavailable for long, and the engine's retry pauses have grown; this worker restarts."
             )
+            _survive(watch.hand_back)
             logging.shutdown()
             os._exit(1)
         if over():

@@ -7,9 +7,14 @@ from math import degrees
 
 from skills.arrays import Floats
 from skills.db.models import Surgeon, SutureType
+from skills.db.service_tables import Job
 from skills.library.operation.styles import StyleState
 from skills.library.plans.headline import describe_error
 from skills.schemas.people import SurgeonIn, SutureTypeIn
+from skills.schemas.playbacks import PlaybackIn
+from skills.schemas.requests import Schema
+from skills.schemas.training import RetrainingIn, TrainingIn
+from skills.schemas.tries import TryIn
 
 MISSING = "–"
 STATE_MARKS = {"released": "●", "trained": "◐", "stored": "○", "empty": "·"}
@@ -129,7 +134,30 @@ def as_request(row: Surgeon | SutureType) -> dict[str, object]:
     return {"slug": row.slug, **model.model_validate(row, from_attributes=True).model_dump(mode="json")}
 
 
+AGAIN: dict[str, tuple[str, type[Schema]]] = {  # by the kind of a job; an export's filters are not stored
+    "training": ("POST /trainings", TrainingIn),
+    "retraining": ("POST /retrainings", RetrainingIn),
+    "playback": ("POST /playbacks", PlaybackIn),
+    "pictures": ("POST /playbacks/{playback}/pictures", Schema),
+    "try": ("POST /tries", TryIn),
+}
+
+
+def again(job: Job) -> tuple[str, dict[str, object]] | None:
+    """Return the call that requests a job again, and its body; None where that is not known."""
+    if job.kind not in AGAIN:
+        return None
+    path, model = AGAIN[job.kind]
+    around = job.request.get("surroundings", {})
+    stored = {**job.request, "scene": around.get("scene"), "scene_costs": around.get("costs")}
+    # What the request left open: the learners of a batch's styles, the errors of the arms.
+    stored |= {"learner": None} if "joins" in stored else {}
+    stored |= {"errors": None} if stored.get("stated_by") == "installation" else {}
+    return path.format_map(stored), {name: stored[name] for name in model.model_fields if stored.get(name) is not None}
+
+
 FILTERS = {
+    "again": again,
     "as_request": as_request,
     "px": px,
     "points": points,

@@ -28,7 +28,7 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.segments import Segment
-from skills.errors import BadSettings, Conflict, SkillsError
+from skills.errors import BadSettings, Conflict, DatabaseBusy, SkillsError
 from skills.formats.parsed import ParsedContent
 from skills.gridworld import paper
 from skills.gridworld.grid import PathReport, choose_grid, describe_path, discretize
@@ -173,6 +173,8 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         yield _release(
             database, version, actor, settings, wanted=asked.release is True, passes=passes, feasible=feasible
         )
+    except DatabaseBusy:  # refuses nothing: the job waits and begins again
+        raise
     except SkillsError as refused:
         if isinstance(least_mm := refused.numbers.get("least_mm"), float):
             reached_mm = ceil(10 * least_mm) / 10
