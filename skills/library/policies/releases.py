@@ -217,13 +217,12 @@ def _held(policy: PolicyVersion, constant_turn_deg: float) -> list[GateRefusal]:
     driven = policy.manifest.grid_certificate.driven
     if driven is None or driven.orientation == "recorded":
         return []
-    found = [departure_of(one.demo) for one in policy.demonstrations]
-    turn_deg = max((one.deg for one in found if one is not None), default=0.0)
-    if turn_deg <= constant_turn_deg:
+    turns_deg = [turn.deg for one in policy.demonstrations if (turn := departure_of(one.demo)) is not None]
+    if all(deg <= constant_turn_deg for deg in turns_deg):  # each, because `max` passes over a NaN
         return []
     text = (
-        f"its joint limits were checked with the jaw held, but its demonstration turns by {turn_deg:.1f} degrees, over "
-        f"{constant_turn_deg:g}, and a plan turns too; train it again"
+        f"its joint limits were checked with the jaw held, but its demonstration turns by {max(turns_deg):.1f} "
+        f"degrees, over {constant_turn_deg:g}, and a plan turns too; train it again"
     )
     return [GateRefusal("jaw held", text)]
 

@@ -219,7 +219,7 @@ def preview(upload: Upload, parse: Parser = parse_recording) -> described.Record
 
 
 def send_ahead(database: Database, upload: Upload) -> int | None:
-    """Store the chunks of a large upload before its row, in several short transactions, for which others can wait.
+    """Store the chunks of a large upload before its row, in several short transactions, between which others can write.
 
     They belong to nobody until `put_recording` stores the row; if it does not, they are deleted when they are due
     (`skills.library.operation.sweep`).
