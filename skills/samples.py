@@ -163,7 +163,7 @@ def send_trials(
         try:
             # once for each surgeon, not for each trial
             if sent.surgeon not in known:
-                _make_known(client, sent.surgeon, sent.skill_level)
+                make_known(client, sent.surgeon, sent.skill_level)
                 known.add(sent.surgeon)
             with _packed(trial) as file:
                 stored = client.add_recording(file, surgeon=sent.surgeon)
@@ -175,7 +175,7 @@ def send_trials(
         yield sent
 
 
-def _make_known(client: Client, surgeon: str, skill_level: Skill | None) -> None:
+def make_known(client: Client, surgeon: str, skill_level: Skill | None = None) -> None:
     """Create a surgeon, unless the surgeon exists."""
     try:
         client.surgeon(surgeon)

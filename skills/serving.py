@@ -496,13 +496,9 @@ def _leave(_signal: int, _frame: FrameType | None) -> None:
 def _load(settings: Settings, key: str) -> None:
     """Load the samples and train them, over HTTP; print what came of it."""
     errors: list[str] = []
-    try:
-        with Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
-            for demo in load_samples(client, errors):
-                with going_on(errors, f"{demo.surgeon}, {demo.suture}"):
-                    client.train(demo.surgeon, demo.suture, release=True)
-    except SkillsError as error:
-        print(f"The samples are not loaded: {error}", flush=True)
-    else:
-        few = ["Some samples are not loaded or trained:", *dict.fromkeys(errors)]
-        print("\n  ".join(few) if errors else "The samples are loaded.", flush=True)
+    with going_on(errors, "the service"), Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
+        for demo in load_samples(client, errors):
+            with going_on(errors, f"{demo.surgeon}, {demo.suture}"):
+                client.train(demo.surgeon, demo.suture, release=True)
+    few = ["Some samples are not loaded or trained:", *dict.fromkeys(errors)]
+    print("\n  ".join(few) if errors else "The samples are loaded.", flush=True)

@@ -21,7 +21,6 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from functools import partial, wraps
-from math import isfinite
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -191,7 +190,8 @@ def _flags(keywords: Any, declared: Collection[str]) -> Iterator[tuple[inspect.P
             continue  # a value with fields of its own, for which the command has options
         option = OPTIONS.get(name, name).replace("_", "-")
         required = get_origin(kind) is Required
-        among = [one for one in get_args(kind) if one is not NoneType] if _is_union(kind) or required else [kind]
+        is_several = get_origin(kind) in (Union, UnionType, Required)
+        among = [one for one in get_args(kind) if one is not NoneType] if is_several else [kind]
         flag, parse = _flag_type(among)
         repeated = " Repeatable." if get_origin(flag) is list else ""
         switch = f"--{option}/--no-{option}" if kind == (bool | None) else f"--{option}"
@@ -203,10 +203,6 @@ def _flags(keywords: Any, declared: Collection[str]) -> Iterator[tuple[inspect.P
             annotation=Annotated[flag if required else flag | None, info],
         )
         yield parameter, parse
-
-
-def _is_union(kind: Any) -> bool:
-    return get_origin(kind) in (Union, UnionType)
 
 
 def _flag_type(among: Sequence[Any]) -> tuple[Any, Callable[[Any], Any]]:
@@ -286,10 +282,9 @@ def numbers(text: str, count: int) -> list[float]:
         found = [float(part) for part in text.split(",")]
     except ValueError:
         found = []
-    if len(found) == count and not all(map(isfinite, found)):
-        raise BadInput(f"{text!r}: every number must be finite.")
     if len(found) != count:
         raise BadInput(f"{text!r} is not {count} numbers separated by commas.", "Example: 1,2.5,-3")
+    refuse_not_finite(found, lambda _: repr(text))
     return found
 
 

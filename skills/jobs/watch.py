@@ -60,7 +60,7 @@ class Leases:
         passed_s = 0.0 if self._looked_s is None else min(now_s - self._looked_s, LONGEST_LOOK_S)
         self._looked_s = now_s
         self._silent_s = {
-            executor: self._silent_s[executor] + passed_s if self._unchanged(executor, beat) else 0.0
+            executor: self._silent_s[executor] + passed_s if self._seen.get(executor, self) == beat else 0.0
             for executor, beat in beats.items()
         }
         self._seen = dict(beats)
@@ -69,9 +69,6 @@ class Leases:
     def dead(self) -> set[str]:
         """Return the executors whose lease has expired."""
         return {executor for executor, silent_s in self._silent_s.items() if silent_s > self.lease_s}
-
-    def _unchanged(self, executor: str, beat: object) -> bool:
-        return executor in self._seen and self._seen[executor] == beat
 
 
 AT_ONCE = 100  # jobs compared in a round: a round must stay much shorter than a lease
@@ -200,7 +197,9 @@ class Watch:
             self._inherit(dead)
         for executor in others.keys() - holders:
             if silent_s[executor] > FORGOTTEN_AFTER_LEASES * self.leases.lease_s:
-                self._forget(executor, beats[executor])
+                with self.database.writing(()) as session:
+                    silent = delete(Executor).where(Executor.id == executor, Executor.beat_at == beats[executor])
+                    session.execute(silent)
 
     def _forget_ended(self) -> None:
         """Delete some of the engine's rows of workflows that ended long ago; the outcomes are in our rows."""
@@ -234,10 +233,6 @@ class Watch:
         if ours:
             log.warning("Taking over from %s, silent for longer than its lease.", ", ".join(sorted(ours)))
             self.recover(sorted(ours))
-
-    def _forget(self, executor: str, beat_at: object) -> None:
-        with self.database.writing(()) as session:
-            session.execute(delete(Executor).where(Executor.id == executor, Executor.beat_at == beat_at))
 
     def _live(self) -> Sequence[Any]:
         """Return jobs that have not ended: those never enqueued first, then the oldest.

@@ -43,10 +43,11 @@ class Work:
     def try_once(self, row: int, attempt: int, tries: int) -> bool:
         """Try to perform a job and return whether it is settled, by success or by a permanent failure.
 
-        There is a pause before each retry, of `_pause_s`. It is not the engine's durable sleep, which would count a
-        step of the wall clock as time that has passed. A busy database is waited for, and takes no try.
+        There is a pause before each retry; it starts at `FIRST_PAUSE_S` and is multiplied by four each time. It is not
+        the engine's durable sleep, which would count a step of the wall clock as time that has passed. A busy database
+        is waited for, and takes no try.
         """
-        time.sleep(_pause_s(tries))
+        time.sleep(FIRST_PAUSE_S * 4 ** (tries - 1) if tries else 0.0)
 
         def perform() -> None:
             if start(self.database, row, attempt):
@@ -82,18 +83,13 @@ class Work:
 
     def _when_not_busy(self, row: int, do: Callable[[], object]) -> None:
         """Call a function until the database is not busy; it does nothing once the job has ended or was taken over."""
-        for waited in count(1):
+        for waited in count():
             try:
                 do()
                 return
             except DatabaseBusy as busy:
                 log.warning("Job %d waits for the database: %s", row, busy.message)
-            time.sleep(_pause_s(waited))
-
-
-def _pause_s(failed: int) -> float:
-    """Return the pause after a number of failures: none, `FIRST_PAUSE_S`, then four times the one before, limited."""
-    return min(FIRST_PAUSE_S * 4 ** (failed - 1), LONGEST_PAUSE_S) if failed else 0.0
+            time.sleep(min(FIRST_PAUSE_S * 4**waited, LONGEST_PAUSE_S))
 
 
 def start(database: Database, row: int, attempt: int) -> bool:

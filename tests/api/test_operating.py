@@ -106,7 +106,9 @@ def test_samples_that_cannot_be_loaded_are_told_in_a_sentence(
 
     monkeypatch.setattr("skills.serving.load_samples", refuse)  # only a service that was damaged refuses them
     _load(Settings(), "")
-    assert capsys.readouterr().out == "The samples are not loaded: The signing key is missing.\n"
+    assert capsys.readouterr().out == (
+        "Some samples are not loaded or trained:\n  the service: The signing key is missing.\n"
+    )
 
 
 def test_a_sample_that_is_refused_leaves_the_others_to_be_trained(

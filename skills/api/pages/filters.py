@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
 from math import degrees
+from typing import Any
 
 from skills.arrays import Floats
 from skills.db.models import Surgeon, SutureType
@@ -12,7 +13,6 @@ from skills.library.operation.styles import StyleState
 from skills.library.plans.headline import describe_error
 from skills.schemas.people import SurgeonIn, SutureTypeIn
 from skills.schemas.playbacks import PlaybackIn
-from skills.schemas.requests import Schema
 from skills.schemas.training import RetrainingIn, TrainingIn
 from skills.schemas.tries import TryIn
 
@@ -134,26 +134,21 @@ def as_request(row: Surgeon | SutureType) -> dict[str, object]:
     return {"slug": row.slug, **model.model_validate(row, from_attributes=True).model_dump(mode="json")}
 
 
-AGAIN: dict[str, tuple[str, type[Schema]]] = {  # by the kind of a job; an export's filters are not stored
-    "training": ("POST /trainings", TrainingIn),
-    "retraining": ("POST /retrainings", RetrainingIn),
-    "playback": ("POST /playbacks", PlaybackIn),
-    "pictures": ("POST /playbacks/{playback}/pictures", Schema),
-    "try": ("POST /tries", TryIn),
-}
+AGAIN: Any = {"training": TrainingIn, "retraining": RetrainingIn, "playback": PlaybackIn, "try": TryIn}
 
 
 def again(job: Job) -> tuple[str, dict[str, object]] | None:
-    """Return the call that requests a job again, and its body; None where that is not known."""
+    """Return the call that requests a job again, and its body; None for an export, whose filters are not stored."""
+    if job.kind == "pictures":
+        return f"POST /playbacks/{job.request['playback']}/pictures", {}
     if job.kind not in AGAIN:
         return None
-    path, model = AGAIN[job.kind]
-    around = job.request.get("surroundings", {})
-    stored = {**job.request, "scene": around.get("scene"), "scene_costs": around.get("costs")}
+    scene = job.request.get("surroundings", {})
+    stored = {**job.request, "scene": scene.get("scene"), "scene_costs": scene.get("costs")}
     # What the request left open: the learners of a batch's styles, the errors of the arms.
-    stored |= {"learner": None} if "joins" in stored else {}
-    stored |= {"errors": None} if stored.get("stated_by") == "installation" else {}
-    return path.format_map(stored), {name: stored[name] for name in model.model_fields if stored.get(name) is not None}
+    left_open = "learner" if "joins" in stored else "errors" if stored.get("stated_by") == "installation" else ""
+    named = [name for name in AGAIN[job.kind].model_fields if name != left_open and stored.get(name) is not None]
+    return f"POST /{'tries' if job.kind == 'try' else f'{job.kind}s'}", {name: stored[name] for name in named}
 
 
 FILTERS = {

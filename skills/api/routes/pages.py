@@ -124,14 +124,8 @@ def show_catalogue(
     with page.db.reading() as session:
         found = styles.matrix(session, q, state or None, skill or None, cursor)
         asked = {"q": q, "state": state, "skill": skill}
-        return page.show(
-            "catalogue.html",
-            found=found,
-            asked=asked,
-            sutures=overview.all_suture_types(session),
-            jobs=overview.unsettled_jobs(session),
-            most_counted=styles.MOST_COUNTED,
-        )
+        lists = {"sutures": overview.all_suture_types(session), "jobs": overview.unsettled_jobs(session)}
+        return page.show("catalogue.html", found=found, asked=asked, most_counted=styles.MOST_COUNTED, **lists)
 
 
 @router.get("/pages/styles/{surgeon}/{suture}", dependencies=[needs("reader")])
