@@ -421,7 +421,7 @@ GUARDS = (
     Guard(
         "skills/library/operation/erasure_list.py", 20,
         ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
-        ("Erasures", "_newer", "_merged", "_order", "_listed", "_in_order", "_end_again", "_mark_again", "_served",
+        ("Erasures", "_newer", "_merged", "_order", "_listed", "_in_order", "apply_erasures", "_mark_again", "_served",
          "_narrow", "_both"),
     ),
     Guard(

@@ -65,8 +65,8 @@ class Access:
         # wrong keys, with the time until which each is refused without a query
         self._wrong: WeightedCache[str, float] = WeightedCache(KEPT)
         self._changed = 0.0  # cache entries older than this are invalid
-        self._keys = _Together(lambda keys: self._ask(holders_of, keys))
-        self._cookies = _Together(lambda cookies: self._ask(signed_in, cookies, self.lasts))
+        self._keys = _BatchedLookup(lambda keys: self._ask(holders_of, keys))
+        self._cookies = _BatchedLookup(lambda cookies: self._ask(signed_in, cookies, self.lasts))
         self._lookups = CapacityLimiter(LOOKUPS)
         self._keyless = not settings.beyond_loopback and settings.proxy_header is None
         self._keyless_until = 0.0
@@ -187,7 +187,7 @@ class Access:
         """Return whether a cached look-up is valid; a key revoked elsewhere works for at most `REMEMBERED_S`."""
         return known is not None and self._changed < known.began and time.monotonic() <= known.began + REMEMBERED_S
 
-    async def _find(self, asked: "_Together[T]", text: str, digest: str, address: str, stranger: bool) -> T | None:
+    async def _find(self, asked: "_BatchedLookup[T]", text: str, digest: str, address: str, stranger: bool) -> T | None:
         """Look up a key or cookie; unknown ones beyond the limit of their address are looked up in batches.
 
         A valid key is always found: a caller who shares an address with somebody who guesses keys waits for one batch,
@@ -237,7 +237,7 @@ class Access:
         return await to_thread.run_sync(ask, limiter=self._lookups)
 
 
-class _Together(Generic[T]):
+class _BatchedLookup(Generic[T]):
     """Look-ups of keys or cookies: `find` queries now, `wait_for` joins the next batch, one each `GATHERED_S`."""
 
     def __init__(self, look: Callable[[list[str]], Awaitable[dict[str, T]]]) -> None:

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from time import monotonic
 
 from anyio import to_thread
+from sqlalchemy.exc import SQLAlchemyError
 
 from skills.api.places import Places
 from skills.api.responses import json_of
@@ -107,7 +108,7 @@ class Watching:
             if version is not None and version == self._version:
                 continue
             wanted = {watcher.job for watcher in self._watchers if watcher.now is not None}
-            with suppress(SkillsError):  # the database may be readable again at the next poll
+            with suppress(SkillsError, SQLAlchemyError):  # the database may be readable again at the next poll
                 found = await to_thread.run_sync(_look_at_all, self._database, wanted)
                 self._version = version
                 for watcher in self._watchers:

@@ -33,7 +33,7 @@ from skills import __version__
 from skills.db.revisions import revisions
 from skills.db.session import Database
 from skills.errors import SkillsError
-from skills.library.operation.installation import Condition, condition_of, count_jobs
+from skills.library.operation.installation import InstallationFigures, count_jobs, figures_of_installation
 from skills.logs import log_fields, request_id
 
 MANY_JOBS = 100_000  # ours: counting them takes 10 to 20 ms
@@ -107,7 +107,7 @@ class Installation(Collector):
         yield GaugeMetricFamily("skills_database_connections_open", "Of this process.", open_)
         try:
             with self._database.reading() as session:
-                found = condition_of(session, self._lease_s)
+                found = figures_of_installation(session, self._lease_s)
             jobs = self._jobs_counted()
         except (SkillsError, SQLAlchemyError):
             yield GaugeMetricFamily("skills_database_up", "Whether the database can be read.", 0)
@@ -145,7 +145,7 @@ class Installation(Collector):
             self._counting.release()
 
 
-def _figures(found: Condition) -> Iterator[Metric]:
+def _figures(found: InstallationFigures) -> Iterator[Metric]:
     took = GaugeMetricFamily("skills_job_seconds", "Duration of the jobs that ended last.", labels=("kind", "quantile"))
     for kind, quantiles in sorted(found.seconds.items()):
         for quantile, seconds in quantiles.items():

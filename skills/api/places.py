@@ -1,4 +1,4 @@
-"""Places for what stays open: the streams of jobs and the sessions of this process, limited for each key."""
+"""Limits on the streams of jobs and the sessions that are open at once in this process, by key and in total."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -9,15 +9,15 @@ from skills.errors import TooMany
 
 
 class Places:
-    """Counts what is open of each key; used on one event loop."""
+    """A counter of the open streams or sessions of each key, with limits; used on one event loop."""
 
     def __init__(self, most_of_key: int, refusal: TooMany, most: float = inf) -> None:
-        """Limit what is open.
+        """Set the limits.
 
         Args:
-            most_of_key: The most of one key; a local caller, who has none, is counted and has no limit.
-            refusal: The error where a limit is reached.
-            most: The most of all together.
+            most_of_key: The most that one key may have open; a local caller, who has no key, is counted without it.
+            refusal: The error that is raised, as a new one each time, where a limit is reached.
+            most: The most that all callers together may have open.
         """
         self._most_of_key, self._most, self._refusal = most_of_key, most, refusal
         self._open: Counter[str | None] = Counter()
@@ -29,7 +29,7 @@ class Places:
 
     @contextmanager
     def place(self, key: str | None) -> Iterator[None]:
-        """Count one more for the duration of the block.
+        """Count one more stream or session of a key for the duration of the block.
 
         Raises:
             TooMany: The key, or all together, have reached their limit.

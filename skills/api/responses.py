@@ -195,7 +195,7 @@ class Conditions:
         return EncodedResponse(200, body.headers, body.content)
 
     def refuse_changed(self, said: Any) -> None:
-        """Check the conditions of a change; an empty header is none.
+        """Check the conditions of a change; an empty header is no condition.
 
         Args:
             said: The current JSON of the resource, as a GET returns it; None if it does not exist.
@@ -203,14 +203,12 @@ class Conditions:
         Raises:
             PreconditionFailed: A condition does not hold.
         """
-        if not self.if_match and not self.if_none_match:
-            return
         tag = None if said is None else tag_of(json_of(said))
-        if self.if_match is not None and (tag is None or not names(self.if_match, tag)):
+        if self.if_match and (tag is None or not names(self.if_match, tag)):
             raise PreconditionFailed(
                 "The object no longer has the ETag in If-Match; read it again, then repeat the request."
             )
-        if self.if_none_match is not None and tag is not None and names(self.if_none_match, tag):
+        if self.if_none_match and tag is not None and names(self.if_none_match, tag):
             raise PreconditionFailed(
                 "An object that matches If-None-Match exists already; read it, then repeat the request."
             )

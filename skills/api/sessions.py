@@ -365,7 +365,7 @@ class Sessions:
                     async with asyncio.timeout(UNKNOWN_S):
                         found = await to_thread.run_sync(_look, self._database, pinned, abandon_on_cancel=True)
                     self._version, self._known_s, self._rows_seen = version, began_s, rows
-                    _tell(looking, found)
+                    _apply(looking, found)
             for one in looking:
                 if self._unknown_s(one) > UNREAD_S or self._database.history.refused is not None:
                     one.end(BUSY, UNREADABLE)
@@ -467,7 +467,8 @@ def _look(database: Database, pinned: set[Pinned]) -> dict[Pinned, Found]:
         return found
 
 
-def _tell(looking: set[Follower], found: dict[Pinned, Found]) -> None:
+def _apply(looking: set[Follower], found: dict[Pinned, Found]) -> None:
+    """End the sessions whose release must not be followed any more, and note newer versions for the others."""
     for one in looking:
         why, one.newer_version = found[one.pinned]
         if why is not None:

@@ -114,21 +114,21 @@ async def _chunks(
     read: Callable[[int], bytes | None], refuse: Callable[[], object], sha256: str, limiter: CapacityLimiter
 ) -> AsyncGenerator[bytes, None]:
     """Yield the chunks of a file; the last one only if all of them together match the digest."""
-    seen, held, number = hashlib.sha256(), b"", 0
+    hasher, held, number = hashlib.sha256(), b"", 0
 
     def read_next() -> bytes | None:
         chunk = read(number)
         if isinstance(chunk, str):  # SQLite does not enforce the column's type
             raise damaged()
         if chunk is not None:
-            seen.update(chunk)
+            hasher.update(chunk)
         return chunk
 
     while (chunk := await to_thread.run_sync(read_next, limiter=limiter)) is not None:
         if held:
             yield held
         held, number = chunk, number + 1
-    if seen.hexdigest() != sha256:
+    if hasher.hexdigest() != sha256:
         await to_thread.run_sync(refuse)
         raise damaged()
     yield held

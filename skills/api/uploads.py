@@ -69,7 +69,7 @@ async def receive(
         )
     if content_encoding not in (None, "identity"):
         raise UnknownFormat("Send the body without Content-Encoding; MCAP compresses itself.")
-    seen, size = hashlib.sha256(), 0
+    hasher, size = hashlib.sha256(), 0
     with tempfile.SpooledTemporaryFile(max_size=SPOOL_BYTES) as file:
         async for data in _in_time(request, settings):
             size += len(data)
@@ -77,9 +77,9 @@ async def receive(
                 limits.upload(caller.key, len(data))
             if size > settings.max_upload_bytes:
                 raise TooLarge(f"The recording is larger than {settings.max_upload_bytes} bytes; cut it.")
-            seen.update(data)
+            hasher.update(data)
             file.write(data)
-        sha256 = seen.hexdigest()
+        sha256 = hasher.hexdigest()
         vouched = check_digest(content_digest, sha256)
         if media_type == BYTES:
             media_type = media_type_of(file)  # type: ignore[arg-type]

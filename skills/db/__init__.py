@@ -4,17 +4,22 @@ Here are the definitions that all tables share: names of constraints, UTC timest
 query of the newest rows.
 
 models           the tables of the library
-service_tables   the tables of the service: jobs, workers, keys, sign-ins, the audit log
+service_tables   the tables of the service: jobs with their datasets, workers, keys, sign-ins, the audit log
 session          sessions and their errors
 engines          opening a database
 disk             private files; a full and a failed disk
 revisions        the version of the tables, and their migrations
-packed           values in one column, and the archive format that they are stored in
+packed           values in one column: serialised without pickle, and verified at every read
 history          the log of all changes, written with them
+change_notes     the rows that a transaction has changed, noted by triggers
+logged_rows      the tables and columns that the history logs, each as the bytes that its digest covers
+leaves           the leaves of the history, and the checkpoints over them
 tiles            the inner hashes of its tree, stored by 256
+saved_heads      its signed heads, in a file outside the database
 row_visibility   rules that restrict a caller's queries to some surgeons
-changes          a cache, and change detection for caches, without reading a table
-archive          backups
+changes          change detection for caches, without reading a table
+weighted_cache   a least-recently-used cache for several threads
+dump             backups
 """
 
 from collections.abc import Iterator, Sequence

@@ -116,20 +116,19 @@ def write(file: IO[bytes], connection: Connection, code: str, progress: Callable
 
 def _write_table(archive: ZipFile, connection: Connection, table: Table) -> Dumped:
     columns = [(column.name, kind_of(column)) for column in table.columns]
-    counter = table.autoincrement_column
-    last = 0 if counter is None else _last_number(connection, table.name, counter.name)
+    counter = None if (column := table.autoincrement_column) is None else column.name
+    last = 0 if counter is None else _last_number(connection, table.name, counter)
     raw, holds_bytes = raw_table(table.name, columns), any(kind == "bytes" for _, kind in columns)
     query = select(raw).order_by(*(raw.c[key.name] for key in table.primary_key))
     query = query.execution_options(yield_per=ROWS_WITH_BYTES_AT_ONCE if holds_bytes else ROWS_AT_ONCE)
-    seen, rows = hashlib.sha256(), 0
+    hasher, rows = hashlib.sha256(), 0
     with archive.open(member_of(table.name), "w", force_zip64=True) as out:
         for row in connection.execute(query):
             for piece in _lay_out(row, columns):
-                seen.update(piece)
+                hasher.update(piece)
                 out.write(piece)
             rows += 1
-    of_counter = None if counter is None else counter.name
-    return Dumped(name=table.name, columns=columns, rows=rows, sha256=seen.hexdigest(), counter=of_counter, last=last)
+    return Dumped(name=table.name, columns=columns, rows=rows, sha256=hasher.hexdigest(), counter=counter, last=last)
 
 
 def _lay_out(row: Sequence[Any], columns: Sequence[tuple[str, str]]) -> Iterator[bytes]:
@@ -250,10 +249,10 @@ def _damage(file: IO[bytes]) -> str:
 def _digest(file: IO[bytes], end: int) -> str:
     """Return the SHA-256 of the file's first `end` bytes; the position is `end` afterwards."""
     file.seek(0)
-    seen = hashlib.sha256()
+    hasher = hashlib.sha256()
     while piece := file.read(min(PIECE_BYTES, end - file.tell())):
-        seen.update(piece)
-    return seen.hexdigest()
+        hasher.update(piece)
+    return hasher.hexdigest()
 
 
 # ---- row numbers, which are never reused ------------------------------------------------------------------------

@@ -292,7 +292,7 @@ class Demonstration(Identified):
 
     @hybrid_property
     def learnable(self) -> bool:
-        """True if a style may be learnt from it without being told so: it is active, and not `failed`."""
+        """True if a training takes it without outcomes "any": it is active, and not `failed`."""
         return self.withdrawn_at is None and not self.failed
 
     @learnable.inplace.expression

@@ -68,30 +68,21 @@ def _packed(tree: Any, arrays: Arrays) -> bytes:
     return FORMAT + hashlib.sha256(body).digest() + body
 
 
-def unpack(data: bytes) -> Any:
-    """Deserialise a value.
+def unpack_as(kind: type[T], data: bytes) -> T:
+    """Deserialise a value of one class.
 
     Raises:
-        Corrupt: A byte differs from the stored ones, or the format is unknown to this version.
+        Corrupt: A byte differs from the stored ones, the format is unknown to this version, or it is of another class.
     """
     head, checksum, body = data[:8], data[8:40], data[40:]  # format number, SHA-256, compressed file
     if head != FORMAT or hashlib.sha256(body).digest() != checksum:
         raise Corrupt("A stored value does not match its checksum and was not used; restore it from a backup.")
     try:
-        return packing.assemble(load(isal_zlib.decompress(body)), _VALUES)
+        built = packing.assemble(load(isal_zlib.decompress(body)), _VALUES)
     except Exception as error:  # intact, but of an unknown class, or its constructor refuses the numbers
         raise Corrupt(
             "A stored value has a format that this version does not know and was not used; update the code."
         ) from error
-
-
-def unpack_as(kind: type[T], data: bytes) -> T:
-    """Deserialise a value of one class.
-
-    Raises:
-        Corrupt: As for `unpack`, or it is of another class.
-    """
-    built = unpack(data)
     if not isinstance(built, kind):
         raise Corrupt(f"A stored value is a {type(built).__name__} where a {kind.__name__} should be.")
     return built

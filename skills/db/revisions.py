@@ -37,10 +37,10 @@ def baseline() -> str:
     folder = Path(str(MIGRATIONS))  # at the top of the repository, behind a link
     sources = {f"migrations/{file.relative_to(folder)}": file for file in folder.rglob("*.py")}
     sources |= {str(file.relative_to(PACKAGE)): file for file in PACKAGE.rglob("*.py")}
-    seen = hashlib.sha256()
+    hasher = hashlib.sha256()
     for name, file in sorted(sources.items()):
-        seen.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
-    return f"0001.{seen.hexdigest()[:12]}"
+        hasher.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return f"0001.{hasher.hexdigest()[:12]}"
 
 
 def alembic_config() -> "Config":

@@ -72,7 +72,10 @@ def save_head(file: Path, note: str) -> None:
             last = last_head(file)
             before = None if last is None else last.checkpoint
             if before is None or before.origin != head.checkpoint.origin or before.size < head.checkpoint.size:
-                os.write(handle, f"{note}\n".encode())
+                end, text = os.fstat(handle).st_size, f"{note}\n".encode()
+                if os.write(handle, text) < len(text):  # the disk has space for a part of it
+                    os.ftruncate(handle, end)  # otherwise the file would end in no checkpoint, and all be refused
+                    raise OSError("no space left on its disk")
                 os.fsync(handle)
         finally:
             os.close(handle)

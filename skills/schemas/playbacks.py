@@ -49,6 +49,16 @@ class ArmErrorsIn(Schema):
     sources: ErrorSources
 
 
+ErrorsIn = Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None
+
+
+def errors_of(stated: ErrorsIn) -> ArmErrors | None:
+    """Return the errors that a request states, as a value of the domain; None where it states none."""
+    if isinstance(stated, ArmErrorsIn):
+        return checked_own(ArmErrors(**stated.model_dump()))
+    return None if stated is None else NAMED[stated]
+
+
 class PlaybackIn(Schema):
     """A playback: the plan to play in the simulator, and the errors of the arms to judge it under.
 
@@ -59,14 +69,12 @@ class PlaybackIn(Schema):
     model_config = shown({"plan": "0123456789abcdef" * 4}, {"plan": "0123456789abcdef" * 4, "errors": "calibrated"})
 
     plan: DigestField
-    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = None
+    errors: ErrorsIn = None
 
     @property
     def arm_errors(self) -> ArmErrors | None:
         """The errors as a value of the domain."""
-        if self.errors is None or isinstance(self.errors, str):
-            return None if self.errors is None else NAMED[self.errors]
-        return checked_own(ArmErrors(**self.errors.model_dump()))
+        return errors_of(self.errors)
 
 
 @schema
@@ -101,8 +109,7 @@ class Verdict(PlaybackReport):
     @property
     def identity(self) -> str:
         """The digest of a playback: over its plan and this verdict as it is stored."""
-        plain = TypeAdapter(Verdict).dump_python(self, mode="json")
-        return sha256(canonical([self.plan, plain]))
+        return sha256(canonical([self.plan, TypeAdapter(Verdict).dump_python(self, mode="json")]))
 
 
 def finite(verdict: Verdict) -> Verdict:

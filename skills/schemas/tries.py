@@ -12,9 +12,9 @@ from pydantic import Field, JsonValue, StrictBool
 from skills.gridworld.grid import MAX_HYSTERESIS
 from skills.schemas import Given
 from skills.schemas.plans import PsmMIn
-from skills.schemas.playbacks import ArmErrorsIn
+from skills.schemas.playbacks import ErrorsIn, errors_of
 from skills.schemas.requests import Coordinate, DigestField, Schema, SlugField, shown
-from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
+from skills.verification.arm_errors import ArmErrors
 
 LOSS_MM = 2.6  # ours: samples spread evenly in the paper's cells of 5 mm are 2.5 mm (RMSE, 3-D) from the centres
 
@@ -54,15 +54,13 @@ class TryIn(Schema):
     hysteresis: Annotated[float, Field(ge=0, le=MAX_HYSTERESIS)] | None = None
     release: StrictBool | None = None
     tissue_mm: Literal["none"] | Coordinate | None = None
-    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = None
+    errors: ErrorsIn = None
     psm_m: PsmMIn | None = None
 
     @property
     def arm_errors(self) -> ArmErrors | None:
         """The errors as a value of the domain."""
-        if self.errors is None or isinstance(self.errors, str):
-            return None if self.errors is None else NAMED[self.errors]
-        return checked_own(ArmErrors(**self.errors.model_dump()))
+        return errors_of(self.errors)
 
 
 class Choice(Given):

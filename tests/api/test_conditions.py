@@ -49,6 +49,8 @@ def test_a_change_of_what_was_seen_last_is_made_and_any_other_refused(service: S
         seen = service.http.get(address).headers["etag"]
         assert put(address, json=new, headers={"If-Match": seen}).status_code == 200
         assert_problem(put(address, json=old, headers={"If-Match": seen}), 412)
+        empty = {"If-Match": "", "If-None-Match": '"other"'}
+        assert put(address, json=new, headers=empty).status_code == 200, "an empty header is no condition"
         assert service.http.get(address).json().items() >= new.items()
 
 

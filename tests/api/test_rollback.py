@@ -15,6 +15,7 @@ from skills.errors import Conflict, NotReady
 from skills.library.operation.backup import accept_rollback, back_up, restore
 from skills.library.operation.erasure_list import erasures_of
 from skills.library.operation.history import Verified, sign_history, sign_some_history, verify_history
+from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw
 from skills.schemas.people import SurgeonIn
@@ -129,6 +130,24 @@ def test_a_rollback_is_accepted_by_a_command_that_is_logged(url: str):
     with serving(url) as service:
         assert_problem(service.http.get(POLICY), 404)  # withdrawn again, by the list
         service.client.put_surgeon("heron")
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_a_surgeon_that_the_list_erases_again_is_nowhere_in_the_files(url: str):
+    with closing(Database(url)) as database:
+        cases.add_surgeon(database, "waxwing")
+        sign_history(database)
+    older = copy_away(url)
+    with closing(Database(url)) as database:
+        cases.committed(database, erase_surgeon, "waxwing", "test")
+        sign_history(database)
+        listed = erasures_of(database)
+    put_back(older, url)
+    file = Path(url.removeprefix("sqlite:///"))
+    with closing(Database(url)) as database:
+        assert b"waxwing" in file.read_bytes()
+        assert accept_rollback(database, listed)["surgeons_erased"] == 1
+        assert not [one.name for one in file.parent.glob(f"{file.name}*") if b"waxwing" in one.read_bytes()]
 
 
 def test_a_history_that_went_another_way_is_not_served(url: str):

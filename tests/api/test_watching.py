@@ -11,6 +11,7 @@ import httpx2 as httpx
 import pytest
 import uvicorn
 from sqlalchemy import event
+from sqlalchemy.exc import InternalError
 
 from skills.db.session import Database
 from skills.library.people.keys import create_key, revoke_key
@@ -98,6 +99,31 @@ def test_fifty_watchers_cost_no_more_looks_than_one(asked: tuple[Service, str, s
     with httpx.Client(base_url=address, timeout=PATIENCE_S, limits=limits) as http:
         looks, lasted_s = looks_of(service, http, path, 50, 2.0)
     assert looks <= 7.5 * lasted_s, looks  # five a second from watching on PostgreSQL, and the sweep of the cache
+
+
+def test_a_look_that_fails_does_not_end_the_looks_for_all(asked: tuple[Service, str, str]):
+    service, address, path = asked
+    failed: list[object] = []
+
+    def fail(*_: object) -> None:
+        failed.append(None)
+        raise InternalError("SELECT", {}, Exception("not one of those that are translated"))
+
+    with httpx.Client(base_url=address, timeout=PATIENCE_S) as http, http.stream("GET", path) as answer:
+        lines, since = answer.iter_lines(), time.monotonic()
+        assert next(lines) == "event: job"
+        event.listen(service.database.engine, "before_cursor_execute", fail)
+        with closing(Database(service.database.url)) as database:
+            cases.add_surgeon(database, "wren")  # a commit, which is looked at
+        while not failed:
+            time.sleep(0.01)
+        event.remove(service.database.engine, "before_cursor_execute", fail)
+        assert httpx.delete(address + path.removesuffix("/events"), timeout=PATIENCE_S).status_code == 200
+        for line in lines:
+            assert time.monotonic() < since + PATIENCE_S, "it goes on, without the change"
+            if '"state":"cancelled"' in line:
+                return
+        raise AssertionError("it ended without the change")
 
 
 def test_a_change_is_told_to_all_who_watch(asked: tuple[Service, str, str]):

@@ -21,7 +21,7 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.jobs.watch import Leases, Watch
 from skills.library.operation import jobs
-from skills.library.operation.installation import condition_of, count_jobs
+from skills.library.operation.installation import count_jobs, figures_of_installation
 from skills.library.operation.jobs import BATCH
 from skills.library.people import surgeons
 from skills.library.policies import versions
@@ -81,7 +81,7 @@ class Hospital:
         """Return the size of the database in bytes."""
         self.database.forget()
         with self.database.reading() as session:
-            return condition_of(session, LEASE_S).database_bytes
+            return figures_of_installation(session, LEASE_S).database_bytes
 
 
 def scaling(table: Table, few: int = FEW, many: int = MANY) -> None:
@@ -175,7 +175,7 @@ CALLS: dict[str, Call] = {
     "jobs that succeeded": lambda s, _: jobs.list_jobs(s, PAGE, None, "succeeded"),
     "jobs that failed": lambda s, _: jobs.list_jobs(s, PAGE, None, "failed"),
     "a page of a batch's styles": lambda s, _: list_styles(s, last_batch(s), PAGE, None, None),
-    "the figures of /metrics": lambda s, _: (condition_of(s, LEASE_S), count_jobs(s)),
+    "the figures of /metrics": lambda s, _: (figures_of_installation(s, LEASE_S), count_jobs(s)),
 }
 
 

@@ -5,6 +5,7 @@ import io
 import json
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from skills import packing
 from skills.comparison.distances import STATES, Measured
 from skills.comparison.recognition import NUMBERS
 from skills.db import packed  # the tables declare the types that may be stored
-from skills.db.packed import FORMAT, Packed, digest, pack, seal, unpack
+from skills.db.packed import FORMAT, Packed, digest, pack, seal, unpack_as
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.movement import Pause
 from skills.demonstration.partner import Partner, PartnerMotion
@@ -45,6 +46,7 @@ from skills.verification.playback import Pictures, Playback
 from tests.deep.networks import always
 from tests.library.cases import bag, hand_off
 
+unpack = partial(unpack_as, object)
 DEMO = cut_demo(read_recording(io.BytesIO(bag())))
 PATH = discretize(DEMO.tip_mm, PAPER_GRID)
 REWARD = sparse_reward(PATH)

@@ -26,7 +26,7 @@ from skills.formats.lerobot.writer import (
     action_rule,
     dataset_files,
 )
-from skills.library.recordings.datasets import splits_by_surgeon
+from skills.library.recordings.datasets import splits_by_group
 from tests.formats import lerobots
 
 ABOUT = AboutDataset("Sutures", ("PSM1", "PSM2"), licence="CC-BY-4.0", consent="Export, until 2030.")
@@ -267,13 +267,13 @@ def test_no_surgeon_is_in_two_splits_and_the_shares_are_near():
     rng = np.random.default_rng(0)
     for _ in range(50):
         surgeons = {f"s{k}": int(rng.integers(1, 30)) for k in range(40)}
-        splits = splits_by_surgeon(surgeons)
+        splits = splits_by_group(surgeons)
         assert splits.keys() == surgeons.keys()
         shares = {name: sum(n for s, n in surgeons.items() if splits[s] == name) for name in ("train", "val", "test")}
         total = sum(surgeons.values())
         assert abs(shares["train"] / total - 0.8) < 0.05
         assert abs(shares["val"] / total - 0.1) < 0.05
-    assert splits_by_surgeon({"one": 3}) == {"one": "train"}
+    assert splits_by_group({"one": 3}) == {"one": "train"}
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import os
 import random
 import re
+import resource
 import shutil
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -18,7 +19,7 @@ from skills.db.change_notes import take_notes
 from skills.db.leaves import CHECKPOINTS, LEAVES, latest_leaves, newest_checkpoint
 from skills.db.logged_rows import COLUMNS_NOT_LOGGED, NOT_LOGGED, digests_of, logged
 from skills.db.models import Release, Surgeon
-from skills.db.saved_heads import save_head
+from skills.db.saved_heads import last_head, save_head
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.db.tiles import TILES, stored_tiles
@@ -671,6 +672,24 @@ def test_a_tree_that_was_changed_is_not_signed_on(full: Database):
         with pytest.raises(Corrupt, match="nothing is signed on top"):
             full.history.sign(connection)
         connection.rollback()
+
+
+def test_a_head_that_a_full_disk_cuts_off_leaves_the_last_one(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    file, key = tmp_path / "heads", SigningKey(b"k" * 32)
+    first, second, third = (key.sign(Checkpoint("suture-skills/0", size, bytes(32))) for size in (1, 2, 3))
+    save_head(file, first)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for beyond in range(0, len(second), 7):  # a disk takes a part of a write, where a block ends
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file.stat().st_size + beyond, limits[1]))
+        try:
+            save_head(file, second)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert last_head(file) == read_notes(first)[0]
+    assert "could not be appended" in caplog.text
+    save_head(file, third)
+    assert last_head(file) == read_notes(third)[0]
+    assert len(read_notes(file.read_text())) == 2
 
 
 def test_a_head_that_cannot_be_kept_is_no_reason_to_stop(tmp_path: Path, caplog: pytest.LogCaptureFixture):

@@ -209,6 +209,7 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
         ({"estimate": doubt_of(0.95, 0.89)}, {}, "only 0.890, and 0.9 is required"),
         ({"estimate": doubt_of(0.0)}, {"lower_bound": 0.0}, None),
         ({"estimate": doubt_of(math.nan)}, {}, "only nan"),
+        ({"estimate": doubt_of(0.95, math.nan)}, {}, "only nan"),
         ({"estimate": doubt_of(0.95)}, {"lower_bound": math.nan}, "nan is required"),
         (
             {"estimate": doubt_of(0.85)},

@@ -56,8 +56,8 @@ def get_policy_card_signature(surgeon: Slug, suture: Slug, version: Version, db:
 def get_policy_version_card(policy: Digest, db: Db, give: Giving, accept: Accept) -> Response:
     """Return the policy card of a version by the digest under which it is cited."""
     as_page = _as_page(accept)
-    seen = versions.followable if as_page else lambda version: version
-    return _answer(give, _card(db, lambda session: seen(versions.find_by_digest(session, policy))), as_page)
+    checked = versions.followable if as_page else lambda version: version
+    return _answer(give, _card(db, lambda session: checked(versions.find_by_digest(session, policy))), as_page)
 
 
 def _as_page(accept: str) -> bool:
@@ -76,9 +76,9 @@ def _content(card: Card, *, as_page: bool) -> bytes:
 
 
 def _answer(give: Give, card: Card, as_page: bool) -> Response:
-    told, kind = card.facts.policy, "html" if as_page else "json"
+    policy, kind = card.facts.policy, "html" if as_page else "json"
     answer = give.bytes(_content(card, as_page=as_page), HTML if as_page else JSON)
-    name = f"{told.surgeon}-{told.suture}-v{told.version}-card.{kind}"
+    name = f"{policy.surgeon}-{policy.suture}-v{policy.version}-card.{kind}"
     answer.headers["Content-Disposition"] = f'inline; filename="{name}"'  # the name under which a browser saves it
     if as_page:
         answer.headers.update(standalone_headers("card"))

@@ -159,7 +159,6 @@ def withdraw_demo(demo: Digest, db: Db, jobs: Jobs, caller: Asking, conditions: 
             dropped = erasure.erase_demo(session, demo, caller.name)
     if erase:
         sweep_erased(db)
-        db.forget()
     # after the commit, because one transaction cannot span our database and the engine's
     for row, attempt in dropped:
         jobs.cancel(row, attempt)

@@ -58,8 +58,8 @@ def cancel_job(job: JobId, db: Db, jobs: Jobs, actor: Actor) -> Response:
         row = asked.find_job(session, job).row
     with db.writing([locks.job(row)]) as session:
         cancelled = asked.cancel(session, job, actor)
-        told = attempts_to_submit(session, cancelled)
+        attempts = attempts_to_submit(session, cancelled)
         said = describe_job(session, cancelled)
-    for row, attempt in told:
+    for row, attempt in attempts:
         jobs.cancel(row, attempt)
     return say(said)

@@ -61,7 +61,6 @@ def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, conditions: I
         conditions.refuse_changed(Surgeon.model_validate(surgeons.find_surgeon(session, surgeon)))
         dropped = erasure.erase_surgeon(session, surgeon, actor)
     sweep_erased(db)
-    db.forget()  # erased data must not stay in SQLite's write-ahead log
     # after the commit, because one transaction cannot span our database and the engine's
     for row, attempt in dropped:
         jobs.cancel(row, attempt)

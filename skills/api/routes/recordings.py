@@ -88,7 +88,6 @@ def delete_recording(recording: Digest, db: Db, caller: Asking) -> None:
     with db.ending([locks.recording(recording)]) as session:
         erasure.delete_recording(session, recording, caller.name, as_admin=as_admin)
     sweep_erased(db)
-    db.forget()
 
 
 Number = Annotated[int, Path(ge=1, le=1_000_000, description="The number of the proposal, counted from 1.")]

@@ -12,7 +12,7 @@ from skills.api.routes.pages import WebPage
 from skills.api.routes.pages import router as page_router
 from skills.formats import MCAP
 from skills.formats.bag_writer import timeline_mcap
-from skills.library.recordings.timelines import Source, check_export, chosen, motion_named, timeline_of
+from skills.library.recordings.timelines import FIND, Source, check_export, chosen, motion_named, timeline_of
 from skills.schemas.timelines import MotionTimeline
 
 router = router_of("timelines")
@@ -22,7 +22,7 @@ SPAN, MOST_MARKS = r"^\d{1,6}(\.\d{1,6})?-\d{1,6}(\.\d{1,6})?$", 20
 
 
 @router.get("/timelines/{source}/{digest}", **gives("reader", MotionTimeline, 404, 409, 415, as_well=(MCAP,)))
-def get_timeline(source: Source, digest: Digest, db: Db, tell: Parse, give: Giving, accept: Accept) -> Response:
+def get_timeline(source: Source, digest: Digest, db: Db, parse: Parse, give: Giving, accept: Accept) -> Response:
     """Return a recording, a demonstration, a learnt path or a plan as columns on one clock, to be played.
 
     At most 200 rows a second and 24,000 in all. `Accept: application/vnd.mcap` returns an MCAP file for viewers such as
@@ -30,10 +30,11 @@ def get_timeline(source: Source, digest: Digest, db: Db, tell: Parse, give: Givi
     plan, or an export, for the file of a recording or a demonstration; or somebody recorded allows no use.
     """
     mcap = negotiate(accept, "A timeline", JSON, MCAP) == MCAP
-    if mcap:
-        with db.reading() as session:
+    with db.reading() as session:
+        digest = FIND[source](session, digest).sha256  # in full: the argument may be a prefix
+        if mcap:
             check_export(session, source, digest)
-    found = timeline_of(db, source, digest, tell)
+    found = timeline_of(db, source, digest, parse)
     if not mcap:
         return give(MotionTimeline(source=source, sha256=digest, timeline=found))
     given = give.bytes(timeline_mcap(found, f"{source}/{digest}"), MCAP)

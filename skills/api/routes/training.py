@@ -41,9 +41,9 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
     refuse_release(caller, body.release)
     job, new, did = request_retraining(db, body, actor, GateLimits.of(settings))
     with db.reading() as session:
-        told = attempts_to_submit(session, job) if new else []
+        attempts = attempts_to_submit(session, job) if new else []
         answer = accepted(session, job, did)
-    for row, attempt in told:
+    for row, attempt in attempts:
         jobs.submit(row, attempt, PART)
     return answer
 

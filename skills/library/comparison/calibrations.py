@@ -154,7 +154,7 @@ def digest_of(about: Calibration) -> str:
 
 
 def newest(session: Session) -> StoredCalibration | None:
-    """Return the current calibration; None if there is none."""
+    """Return the current calibration, the one stored last; None if there is none."""
     return session.scalar(select(StoredCalibration).order_by(StoredCalibration.row.desc()).limit(1))
 
 

@@ -191,6 +191,8 @@ def recognise_recording(database: Database, recording_sha256: str, suture: str, 
         Conflict: Several surgeons have demonstrations in the recording.
         BadInput: There are not two surgeons with two sessions each, or no movement of the recording could be tested.
     """
+    with database.reading() as session:
+        recording_sha256 = find_recording(session, recording_sha256).sha256  # in full: the argument may be a prefix
     chosen = _known(database, recording_sha256, suture)
     moved = {sha256: _movements(database, sha256, one, parse) for sha256, one in chosen.items()}
     still = _known(database, recording_sha256, suture)  # consent may have ended while they were read

@@ -259,14 +259,14 @@ def score(database: Database, asked: described.ScoreIn, parse: Parser) -> descri
         reference, because = _reference(session, asked.surgeon, asked.suture, asked.reference)
         require(reference.surgeon, "atlas")
         scored = _stored(session, asked)
-        taught, expert = reference.demo, _of_expert(session, reference, scored.row if scored else None)
+        reference_demo, expert = reference.demo, _of_expert(session, reference, scored.row if scored else None)
     if scored is None:
         scored = _of_recording(database, asked, parse)
     # No transaction is open during the computation.
-    numbers, beside = measure(scored.demo), measure(taught)
-    deviation = laid_on(scored.demo, taught)
+    numbers, beside = measure(scored.demo), measure(reference_demo)
+    deviation = laid_on(scored.demo, reference_demo)
     expert = [one for one in expert if shape_or_none(one) is not None]
-    named = differences(scored.demo, expert, taught) if expert else None
+    named = differences(scored.demo, expert, reference_demo) if expert else None
     skill = _skill(database, scored.recording, asked.task, parse)
     with database.reading() as session:  # again: consent may have ended while the two were compared
         _agreed_still(session, [reference, scored.row], scored.recording)
@@ -291,7 +291,7 @@ def score(database: Database, asked: described.ScoreIn, parse: Parser) -> descri
         figures=compare(numbers, beside),
         deviation=deviation,
         differences=named,
-        as_recorded=as_recorded(scored.demo, taught),
+        as_recorded=as_recorded(scored.demo, reference_demo),
         tie_break=TIE_BREAK,
         percentiles=percentiles(others, mine, row, reference),
         curve=_curve(own),

@@ -18,7 +18,7 @@ from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.db.tiles import fill_tiles
 from skills.errors import Conflict, NotReady
-from skills.library.operation.erasure_list import NOTHING, Erasures, _end_again
+from skills.library.operation.erasure_list import NOTHING, Erasures, apply_erasures
 from skills.library.operation.files import appearing_file
 from skills.library.operation.history import sign_history
 from skills.library.operation.jobs import ACTIVE, BATCH
@@ -94,11 +94,10 @@ def restore(
             database.history.go_on_after_restore(session.connection())
             fill_tiles(session.connection())
             progress("erasures")
-            restored = Restored(manifest, **_end_again(session, erasures))
+            restored = Restored(manifest, **apply_erasures(session, erasures))
             session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(submitted_at=None))
             record_event(session, "local", "restore", "installation", manifest.created_at)
     sweep_erased(database)
-    database.forget()
     return restored
 
 
@@ -124,7 +123,7 @@ def accept_rollback(database: Database, erasures: Erasures = NOTHING) -> dict[st
             raise Conflict("The database is the one whose history was saved last: there is nothing to accept.")
         history.compare(connection, None)
         archive_heads(history.heads_file)
-        ended = _end_again(session, erasures)
+        ended = apply_erasures(session, erasures)
         session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(submitted_at=None))
         size = 0 if saved is None else saved.checkpoint.size
         record_event(session, "local", "accept", "rollback", f"{size} leaves")

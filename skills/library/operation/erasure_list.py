@@ -245,7 +245,7 @@ def _in_order(session: Session) -> Iterator[tuple[Any, datetime]]:
         yield event, last
 
 
-def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
+def apply_erasures(session: Session, erasures: Erasures) -> dict[str, int]:
     """Apply the entries of a list that the backup does not know; an entry that it knows may have been added anew since.
 
     An erased surgeon that is not in the backup stays listed, so that nobody can take the pseudonym.

@@ -36,7 +36,7 @@ from skills.library.operation.integrity import OF_DEMO, covered, demo_identity, 
 from skills.library.operation.jobs import identity_of
 from skills.library.policies.combined import learnt_from
 from skills.library.policies.pose_styles import poses_of_demonstrations
-from skills.library.policies.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
+from skills.library.policies.relearning import Recomputed, StoredRecordings, compute_again, decoded, learn_again
 from skills.library.recordings.content_cache import alike, cached_content, read_entry
 from skills.library.recordings.recordings import Parser, recording_bytes
 from skills.settings import Settings
@@ -79,7 +79,7 @@ class Checked:
 
 def inspect_installation(
     database: Database,
-    tell: Parser = parse_recording,
+    parse: Parser = parse_recording,
     *,
     decode_all: bool = False,
     heads: Sequence[Note] | None = None,
@@ -90,7 +90,7 @@ def inspect_installation(
 
     Args:
         database: The database, without restriction.
-        tell: The reader of recordings, possibly in another process.
+        parse: The reader of recordings, possibly in another process.
         decode_all: Decode every recording whose content is cached, and not only the newest.
         heads: Signed heads of the history that were kept elsewhere; None: those of the database's own file.
         relearn: The limits of time and memory with which every policy is learnt again; None: none is.
@@ -111,8 +111,8 @@ def inspect_installation(
         # Every model that the registry knows, so that a new table cannot be forgotten.
         if mapper.class_ not in WITH_OTHERS:
             yield from _rows(database, mapper)
-    yield from _decoded_again(database, tell, decode_all)
-    yield from inspect_policies(database, tell, relearn, limit)
+    yield from _decoded_again(database, parse, decode_all)
+    yield from inspect_policies(database, parse, relearn, limit)
 
 
 def _at_once(what: str, look: Callable[[Session, Checked], None], database: Database) -> Iterator[Checked]:
@@ -263,7 +263,7 @@ def _describe(error: Exception) -> str:
 # ---- the cache of recordings -------------------------------------------------------------------------------------
 
 
-def _decoded_again(database: Database, tell: Parser, every: bool) -> Iterator[Checked]:
+def _decoded_again(database: Database, parse: Parser, every: bool) -> Iterator[Checked]:
     """Compare cached contents with their recordings decoded again: of the newest recording, or of every one."""
     checked = Checked("recordings decoded")
     yield checked
@@ -274,13 +274,13 @@ def _decoded_again(database: Database, tell: Parser, every: bool) -> Iterator[Ch
         rows = session.scalars(query if every else query.limit(1)).all()
     for row in rows:
         with checked.noting(f"recordings {row}"):
-            checked.wrong += [(f"recordings {row}", why) for why in _decoded_otherwise(database, row, tell)]
+            checked.wrong += [(f"recordings {row}", why) for why in _decoded_otherwise(database, row, parse)]
         checked.count += 1
         yield checked
     yield checked
 
 
-def _decoded_otherwise(database: Database, row: int, tell: Parser) -> Why:
+def _decoded_otherwise(database: Database, row: int, parse: Parser) -> Why:
     """Yield the fault of a cached content: it differs from the recording's bytes. Damaged ones are found before."""
     with database.reading() as session:
         stored = session.get(models.StoredRecording, row)
@@ -288,7 +288,7 @@ def _decoded_otherwise(database: Database, row: int, tell: Parser) -> Why:
     if kept is None:  # erased or replaced since, or damaged
         return
     try:
-        again = decoded(database, row, tell)
+        again = decoded(database, row, parse)
     except Busy:
         raise
     except (Corrupt, NotFound):  # damaged bytes are reported with the recording; it was erased since
@@ -306,18 +306,18 @@ def _decoded_otherwise(database: Database, row: int, tell: Parser) -> Why:
 
 
 def inspect_policies(
-    database: Database, tell: Parser, relearn: Settings | None, limit: int | None = None
+    database: Database, parse: Parser, relearn: Settings | None, limit: int | None = None
 ) -> Iterator[Checked]:
     """Learn policies again if wanted, and compute the certificates of the others again; see `inspect_installation`."""
     done: set[int] = set()
     if relearn is not None:
-        learn = partial(learn_again, database, recordings=StoredRecordings(database, tell), settings=relearn)
+        learn = partial(learn_again, database, recordings=StoredRecordings(database, parse), settings=relearn)
         yield from _again(database, Checked("policies learnt again"), limit, learn, done)
     yield from _again(database, Checked("certificates"), None, partial(compute_again, database), done)
 
 
 def _again(
-    database: Database, checked: Checked, limit: int | None, compare: Callable[[int], Again], done: set[int]
+    database: Database, checked: Checked, limit: int | None, compare: Callable[[int], Recomputed], done: set[int]
 ) -> Iterator[Checked]:
     """Compute policy versions again that are not done yet, and compare each with what is stored."""
     yield checked
@@ -365,12 +365,12 @@ def _entry(row: models.ParsedRecording) -> None:
 
 
 def _dataset(row: StoredDataset) -> Why:
-    seen, size = hashlib.sha256(), 0
+    hasher, size = hashlib.sha256(), 0
     query = select(DatasetChunk.data).where(DatasetChunk.dataset_row == row.row).order_by(DatasetChunk.number)
     for data in _session_of(row).scalars(query.execution_options(yield_per=1)):
-        seen.update(data)
+        hasher.update(data)
         size += len(data)
-    if seen.hexdigest() != row.sha256:
+    if hasher.hexdigest() != row.sha256:
         yield OTHER_DIGEST
     if size != row.size_bytes:
         yield f"it has {size} bytes, its row has {row.size_bytes}"

@@ -16,7 +16,7 @@ QUANTILES = (0.5, 0.95, 1.0)
 
 
 @dataclass(frozen=True)
-class Condition:
+class InstallationFigures:
     """The figures of an installation; `seconds` are quantiles over the jobs that ended last, by kind.
 
     `verified_at` is when a worker last verified the history, with `faults_found`.
@@ -37,7 +37,7 @@ def count_jobs(session: Session) -> dict[tuple[str, str], int]:
     return {(kind, state): count for kind, state, count in counted}
 
 
-def condition_of(session: Session, lease_s: float) -> Condition:
+def figures_of_installation(session: Session, lease_s: float) -> InstallationFigures:
     """Return the figures of an installation.
 
     Args:
@@ -48,7 +48,7 @@ def condition_of(session: Session, lease_s: float) -> Condition:
     ended = select(Executor.verified_at, Executor.faults_found).where(Executor.verified_at.is_not(None))
     verified_at, found = session.execute(ended.order_by(Executor.verified_at.desc()).limit(1)).first() or (None, None)
     oldest = session.scalar(select(func.min(Job.created_at)).where(Job.state == "queued"))
-    return Condition(
+    return InstallationFigures(
         seconds=_seconds(session),
         oldest_queued_s=0.0 if oldest is None else max(0.0, (at - oldest).total_seconds()),
         workers=sum(abs(at - beat_at) <= timedelta(seconds=lease_s) for beat_at in session.scalars(beats)),

@@ -8,15 +8,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from skills.db import newest, now
-from skills.db.models import (
-    Demonstration,
-    Plan,
-    StoredPictures,
-    StoredPlayback,
-    StoredRecording,
-    Surgeon,
-    SutureType,
-)
+from skills.db.models import Demonstration, Plan, StoredPictures, StoredPlayback, StoredRecording, Surgeon, SutureType
 from skills.db.service_tables import Job
 from skills.library.operation.jobs import ACTIVE, requested_again, shown
 from skills.library.plans.playback_pictures import job_of_pictures

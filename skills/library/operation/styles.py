@@ -163,23 +163,23 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     manifest = [type_coerce(by.manifest, JSON)[names] for names in shown]
     others = select(func.max(PolicyDemonstration.demonstration_row)).where(PolicyDemonstration.policy_row == by.row)
     about = select(by.row, by.version, by.demonstration_row, others.scalar_subquery(), *manifest)
-    told = {row: rest for row, *rest in session.execute(about.where(by.row.in_(wanted.values())))}
+    found = {row: rest for row, *rest in session.execute(about.where(by.row.in_(wanted.values())))}
     asked = select(Job).where(Job.surgeon_row.in_(surgeons), Job.kind == TRAINING, Job.state.in_((*ACTIVE, "failed")))
     asked = asked.where(~requested_again()).order_by(Job.row)
     jobs = {(job.surgeon_row, job.request["suture"]): job for job in session.scalars(asked)}
     return {
-        style: _sum_up(style, demos, versions, told.get(wanted.get(style, 0)), style in released, jobs.get(style))
+        style: _sum_up(style, demos, versions, found.get(wanted.get(style, 0)), style in released, jobs.get(style))
         for style in demos.keys() | versions.keys()
     }
 
 
 def _sum_up(
-    style: _Row, demos: _Counts, versions: _Counts, told: list[Any] | None, released: bool, job: Job | None
+    style: _Row, demos: _Counts, versions: _Counts, about: list[Any] | None, released: bool, job: Job | None
 ) -> StyleState:
     count, newest = demos.get(style, (0, 0))
-    if told is None:
+    if about is None:
         return StyleState(style[1], "stored", count, job=job)
-    version, demonstration_row, other, shape, *shown = told
+    version, demonstration_row, other, shape, *shown = about
     return StyleState(
         suture=style[1],
         state="released" if released else "trained",

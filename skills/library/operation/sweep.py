@@ -69,10 +69,14 @@ class SteadyClock:
 
 
 def sweep_erased(database: Database) -> None:
-    """Delete all that is left of erased surgeons, deleted recordings and interrupted uploads."""
+    """Delete all that is left of erased surgeons, deleted recordings and interrupted uploads, after their commit.
+
+    Erased data must not stay in SQLite's write-ahead log either.
+    """
     deque(_sweep_jobs(database), maxlen=0)
     while _sweep_chunks(database):
         pass
+    database.forget()
 
 
 def sweep(database: Database, settings: Settings, at_most_s: float = inf, *, by_age: bool = True) -> bool:

@@ -21,7 +21,7 @@ from skills.library.policies.combined import learnt_from
 from skills.library.recordings.recordings import Parser
 
 MOST_STARTS = 20_000  # drawn smoothly by a browser: of a larger grid every second, third, ... cell is returned
-MOST_SAMPLES = 1500  # of a line on a screen: more are not visible
+MOST_SAMPLES = 1500  # of a line on a screen; twice as many are not visible
 
 
 def view_of_demo(session: Session, demo: Demonstration) -> dict[str, object]:
@@ -85,9 +85,9 @@ def moves_to_goal(policy: Policy, reaches: NDArray[np.bool_]) -> NDArray[np.int6
     return counted
 
 
-def traces_of(database: Database, recording_sha256: str, tell: Parser) -> dict[str, object]:
+def traces_of(database: Database, recording_sha256: str, parse: Parser) -> dict[str, object]:
     """Return the signals of a stored recording's arms, jaws and clutch over time."""
-    recording = shown_recording(database, recording_sha256, tell).recording
+    recording = shown_recording(database, recording_sha256, parse).recording
     return {"duration_s": recording.duration_s, "arms": [_arm(recording, arm) for arm in recording.arms]}
 
 
@@ -112,7 +112,7 @@ def _pressed(recording: Recording) -> list[list[float]]:
 
 
 def _thinned(values: NDArray[Any]) -> list[Any]:
-    """Return every n-th sample, so that there are not more than a screen can show."""
+    """Return every n-th sample, rounded; of more than `MOST_SAMPLES`, at least these and less than twice as many."""
     return _rounded(values[:: max(1, len(values) // MOST_SAMPLES)])
 
 

@@ -17,15 +17,7 @@ from skills.db.models import Plan, StoredPlayback
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import Corrupt
-from skills.formats.replay_bag import (
-    ArmMotion,
-    ExecutorTimetable,
-    arms_of,
-    folder_of,
-    held_jaw_rad,
-    pass_times,
-    seal,
-)
+from skills.formats.replay_bag import ArmMotion, ExecutorTimetable, arms_of, folder_of, held_jaw_rad, pass_times, seal
 from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VERDICT
 from skills.library.operation import proofs
 from skills.library.operation.integrity import learnt, learnt_in, planned

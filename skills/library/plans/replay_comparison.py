@@ -5,9 +5,7 @@ from sqlalchemy.orm import Session
 
 from skills.arrays import Floats, xyz
 from skills.errors import BadPlan
-from skills.formats.replay_bag import (
-    rows_of_pass,
-)
+from skills.formats.replay_bag import rows_of_pass
 from skills.learning.evaluation import TIE_BREAK, dtw
 from skills.library.operation.integrity import planned
 from skills.library.plans.plans import followed_plan, trajectory_of

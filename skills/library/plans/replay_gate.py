@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from math import nan
 from typing import Literal
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from skills.db import newest
 from skills.db.models import Plan, StoredPlayback
 from skills.errors import Conflict, Corrupt
 from skills.library.operation.integrity import planned
@@ -80,9 +80,7 @@ def cleared(session: Session, row: Plan, plan: SuturePlan, conditions: ReplayCon
             "plan again with the released one."
         )
     releases.refuse_edited_release(session, served[0])
-    played = session.scalar(
-        select(StoredPlayback).where(StoredPlayback.plan_row == row.row).order_by(StoredPlayback.row.desc()).limit(1)
-    )
+    played = session.scalar(newest(StoredPlayback, StoredPlayback.plan_row == row.row))
     if played is None:
         raise Conflict("This plan was not played in the simulator yet.", Remedy(Action.PLAY, plan=row.sha256))
     if (played.report.plan, played.report.identity) != (row.sha256, played.sha256):
@@ -134,10 +132,10 @@ def check_probability(report: Verdict, *, errors: ArmErrors, lower_bound: float)
         Conflict: A pass does not reach it, or the plan was not judged under these errors.
     """
     under = judged_under(report, errors)
-    least = min((one.succeeds.lower for one in under.passes), default=nan)
-    # NaN fails too: it is not >= any bound.
-    if not least >= lower_bound:
-        most = costs_most(report)
+    lowest = [one.succeeds.lower for one in under.passes] or [nan]
+    # NaN fails too: it is not >= any bound. So each is compared: `min` passes over a NaN that is not the first.
+    if failing := [lower for lower in lowest if not lower >= lower_bound]:
+        least, most = min(failing), costs_most(report)
         raise Conflict(
             f"With {describe_errors(under.errors.name)} a pass of this plan may {OF_WORLDS[counted_as(under)]} with a "
             f"probability of "

@@ -11,21 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pydantic import TypeAdapter
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from skills import __version__
 from skills.comparison.combining import Combined
-from skills.db.models import (
-    Demonstration,
-    Plan,
-    PolicyVersion,
-    Release,
-    StoredPlayback,
-    StoredRewardMap,
-    Surgeon,
-)
+from skills.db.models import Demonstration, Plan, PolicyVersion, Release, StoredPlayback, StoredRewardMap, Surgeon
 from skills.db.packed import digest
 from skills.demonstration.demonstration import Demo
 from skills.errors import Corrupt
@@ -66,12 +57,10 @@ from skills.schemas.cards import (
     StartShares,
     TipErrors,
 )
-from skills.schemas.demos import DemoReport
 from skills.schemas.people import SutureType
 from skills.transparency.notes import Note
 from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
-REPORT = TypeAdapter(DemoReport)
 FORMAT = 1  # of the JSON: raise it when a field is removed or changes its meaning
 
 
@@ -193,7 +182,7 @@ def _demonstration(row: Demonstration) -> CardDemonstration:
         row,
         state_in_words=sentence("demonstration_state", row.withdrawn_at, row.outcome, row.outcome_reason),
         path_states=len(row.path.states),
-        report=REPORT.validate_python(report),
+        report=report,
         quality_in_words=sentences("quality", report),
         lost_in_words=sentence("lost", report),
         where=here,

@@ -6,14 +6,7 @@ from typing import NamedTuple
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan
 from skills.kinematics import instrument_of
-from skills.learning.certificate import (
-    Certificate,
-    NearLimits,
-    NearOdds,
-    NearStarts,
-    OddsLimits,
-    least_gamma,
-)
+from skills.learning.certificate import Certificate, NearLimits, NearOdds, NearStarts, OddsLimits, least_gamma
 from skills.learning.dynamic_programming import FAINT
 from skills.learning.policy import Policy
 from skills.learning.pose_step import near_share

@@ -120,8 +120,8 @@ def _comparison(row: StyleToRetrain, serving: _Serving) -> StyleComparison | Non
     then = Released(stored.now_released, stored.not_released_because, stored.remedy)
     asked = then.released or then.not_released_because is not None
     now = serving.released_now(_style(row), row.policy.sha256, asked, then)
-    told = vars(stored) | {"now_released": now.released, "not_released_because": now.not_released_because}
-    return StyleComparison(**told | {"remedy": now.remedy}, was_released=then.released)
+    fields = vars(stored) | {"now_released": now.released, "not_released_because": now.not_released_because}
+    return StyleComparison(**fields | {"remedy": now.remedy}, was_released=then.released)
 
 
 def served_by(session: Session, styles: Iterable[Style]) -> dict[Style, ServedNow]:

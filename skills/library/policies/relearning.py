@@ -1,6 +1,6 @@
 """Certificates computed again and policies learnt again, to be compared with the stored ones.
 
-    PolicyVersion --compute_again--> Again: in what it differs, or why it was not compared
+    PolicyVersion --compute_again--> Recomputed: in what it differs, or why it was not compared
     PolicyVersion and its recordings --learn_again--> likewise
 
 A version names all that it follows from: demonstrations, learner, settings, seed, and the versions of learner and gate.
@@ -41,14 +41,14 @@ BESIDE = "the other arm's motion in its pose style"
 
 
 @dataclass(frozen=True)
-class Again:
+class Recomputed:
     """The result for one version: what differs from the stored one, or why it was not, or not wholly, compared."""
 
     differing: tuple[str, ...] = ()
     left_out: str | None = None
 
 
-def compute_again(database: Database, row: int) -> Again:
+def compute_again(database: Database, row: int) -> Recomputed:
     """Certify and measure a stored policy again, and compare the result with its manifest.
 
     Args:
@@ -62,14 +62,14 @@ def compute_again(database: Database, row: int) -> Again:
     with database.reading() as session:
         version = _found(session, row)
         if (other := _other_learner(version) or _other_demos(version) or _other_gate(version)) is not None:
-            return Again(left_out=f"{other}, its certificate was not computed again")
+            return Recomputed(left_out=f"{other}, its certificate was not computed again")
         policy, found = learnt(version), lessons(session, [one.row for one in version.demonstrations])
     lesson = _lesson(version, found)
     made = certified(lesson, request_of(version.manifest), unpack_as(Demo, lesson.demo), policy)
-    return Again(_differing(version, policy, made))
+    return Recomputed(_differing(version, policy, made))
 
 
-def learn_again(database: Database, row: int, recordings: "StoredRecordings", settings: Settings) -> Again:
+def learn_again(database: Database, row: int, recordings: "StoredRecordings", settings: Settings) -> Recomputed:
     """Cut the demonstrations of a version out of their recordings again, learn from them, and compare the result.
 
     The other arm's motion in its pose style is compared too.
@@ -87,13 +87,13 @@ def learn_again(database: Database, row: int, recordings: "StoredRecordings", se
     with database.reading() as session:
         version = _found(session, row)
         if (other := _other_learner(version) or _other_demos(version)) is not None:
-            return Again(left_out=f"{other}, not learnt again")
+            return Recomputed(left_out=f"{other}, not learnt again")
         policy, gate = learnt(version), _other_gate(version)
         beside = None if version.poses is None else version.poses.poses.path.partner  # its row is checked by itself
         if policy.network is not None:
-            return Again(left_out="learnt by a network, whose values depend on the machine, not learnt again")
+            return Recomputed(left_out="learnt by a network, whose values depend on the machine, not learnt again")
         if (refused := refusal(version.surgeon, "training")) is not None:
-            return Again(left_out=f"not learnt again: {refused.words()}")
+            return Recomputed(left_out=f"not learnt again: {refused.words()}")
         found = lessons(session, [one.row for one in version.demonstrations])
         cut = {one.row: (one, one.demo, one.path) for one in version.demonstrations}
     differing: list[str] = []
@@ -110,7 +110,7 @@ def learn_again(database: Database, row: int, recordings: "StoredRecordings", se
     differing += _differing(version, policy, made, numbers_only=bool(gate))
     if not alike(beside, _beside(made)):
         differing.append(BESIDE)
-    return Again(tuple(differing), None if gate is None else f"{gate}, only its values were compared")
+    return Recomputed(tuple(differing), None if gate is None else f"{gate}, only its values were compared")
 
 
 def _found(session: Session, row: int) -> PolicyVersion:
@@ -128,9 +128,9 @@ def _beside(made: Learnt) -> PartnerMotion | None:
 class StoredRecordings:
     """Reads recordings from their stored bytes; the last one is kept, because versions in turn are often of one."""
 
-    def __init__(self, database: Database, tell: Parser) -> None:
+    def __init__(self, database: Database, parse: Parser) -> None:
         """Read from this database, by a reader that is possibly in another process."""
-        self._database, self._tell = database, tell
+        self._database, self._parse = database, parse
         self._last: tuple[int, ParsedContent] | None = None
 
     def read(self, row: int) -> ParsedContent:
@@ -141,11 +141,11 @@ class StoredRecordings:
         """
         if self._last is None or self._last[0] != row:
             self._last = None  # two large ones do not fit into memory
-            self._last = row, decoded(self._database, row, self._tell)
+            self._last = row, decoded(self._database, row, self._parse)
         return self._last[1]
 
 
-def decoded(database: Database, row: int, tell: Parser) -> ParsedContent:
+def decoded(database: Database, row: int, parse: Parser) -> ParsedContent:
     """Decode the stored bytes of a recording, whatever is cached of it.
 
     Raises:
@@ -159,7 +159,7 @@ def decoded(database: Database, row: int, tell: Parser) -> ParsedContent:
                 raise NotFound("There is no such recording.")
             options = stored.reading.options
             file.writelines(recording_bytes(session, stored))
-        return tell(file, **options)
+        return parse(file, **options)
 
 
 def _lesson(version: PolicyVersion, found: list[Lesson]) -> Lesson:

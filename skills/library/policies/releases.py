@@ -1,19 +1,12 @@
-"""Releases: the served version of a style, the release gate, and the results of jobs in terms of it.
+"""Releases: the served version of a style, its release if the gate passes, and its withdrawal.
 
 A policy version is released, superseded by a later release, or withdrawn. The newest release of a style that is not
 withdrawn is served, for as long as the surgeon's consent covers training. A withdrawal never lets an older release come
 back by itself: the releases that the newest one superseded are withdrawn with it, so that nothing is served until
 somebody releases again.
 
-"Not worse" compares two policies of a style on the same demonstrations, because a policy measured against its own
-demonstration alone is always near. These are all active demonstrations from which either was learnt: dynamic time
-warping of each policy's path from its demonstrated start with every demonstration's path in its grid, in mm, and the
-sum over the demonstrations.
-
-A job's row stores the effect of the job: `released` in the result of a training, `now_released` in the comparison of a
-batch's style. Another version may have been released since, or none may be served any more. So every response about a
-job takes its result from here: `released` and `now_released` are the present state, `was_released` is the effect of the
-job.
+`skills.library.policies.gate` has the checks of the gate, `fit` the comparison with the version that is served, and
+`outcomes` the answers about jobs, which state what is served now.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -39,13 +32,7 @@ from skills.db import now
 from skills.db.changes import announce
 from skills.db.history import HISTORY
 from skills.db.leaves import LEAVES
-from skills.db.models import (
-    Demonstration,
-    PolicyVersion,
-    Release,
-    StoredPoses,
-    Surgeon,
-)
+from skills.db.models import Demonstration, PolicyVersion, Release, StoredPoses, Surgeon
 from skills.db.service_tables import record_event
 from skills.errors import Conflict, NotFound
 from skills.library.operation.history import refuse_edited
@@ -230,13 +217,12 @@ def _held(policy: PolicyVersion, constant_turn_deg: float) -> list[GateRefusal]:
     driven = policy.manifest.grid_certificate.driven
     if driven is None or driven.orientation == "recorded":
         return []
-    found = [departure_of(one.demo) for one in policy.demonstrations]
-    turn_deg = max((one.deg for one in found if one is not None), default=0.0)
-    if turn_deg <= constant_turn_deg:
+    turns_deg = [turn.deg for one in policy.demonstrations if (turn := departure_of(one.demo)) is not None]
+    if all(deg <= constant_turn_deg for deg in turns_deg):  # each, because `max` passes over a NaN
         return []
     text = (
-        f"its joint limits were checked with the jaw held, but its demonstration turns by {turn_deg:.1f} degrees, over "
-        f"{constant_turn_deg:g}, and a plan turns too; train it again"
+        f"its joint limits were checked with the jaw held, but its demonstration turns by {max(turns_deg):.1f} "
+        f"degrees, over {constant_turn_deg:g}, and a plan turns too; train it again"
     )
     return [GateRefusal("jaw held", text)]
 

@@ -99,16 +99,16 @@ def request_retraining(
     with database.writing([locks.job(job.row)]) as session:
         session.execute(update(Job).where(Job.row == job.row).values(submitted_at=now()), **jobs.UNSYNCHRONISED)
         jobs.settle(session, job.row)  # a batch without styles, or whose styles are all done, ends here
-        told = session.get(Job, job.row)
-    if told is None:
+        row = session.get(Job, job.row)
+    if row is None:
         raise Conflict("The surgeon was erased while the batch was requested.")
     if not requested.new:
-        return RequestedJob(told, True, "An equal job is queued already; the rest of its styles were added to it.")
+        return RequestedJob(row, True, "An equal job is queued already; the rest of its styles were added to it.")
     if not styles:
-        return RequestedJob(told, True, "Nothing: no style needs training.")
+        return RequestedJob(row, True, "Nothing: no style needs training.")
     counted = f"{len(styles)} {'style' if len(styles) == 1 else 'styles'}"
     why = " that serve another version than when an equal batch ended" if request.after else ""
-    return RequestedJob(told, True, f"A new job is queued, of {counted}{why}.")
+    return RequestedJob(row, True, f"A new job is queued, of {counted}{why}.")
 
 
 def choose_styles(

@@ -199,6 +199,6 @@ def _digest_of(reading: TableIn) -> str:
 
 def _seal(recording_sha256: str, parameters: str, data: bytes | memoryview) -> str:
     """Return the digest of an entry with the recording to which it belongs: moved to another one, it does not match."""
-    seen = hashlib.sha256(canonical([recording_sha256, parameters, READER_VERSION]))
-    seen.update(data)
-    return seen.hexdigest()
+    hasher = hashlib.sha256(canonical([recording_sha256, parameters, READER_VERSION]))
+    hasher.update(data)
+    return hasher.hexdigest()

@@ -21,7 +21,7 @@ from json import load
 from shutil import copyfileobj
 from tempfile import TemporaryFile
 from time import monotonic
-from typing import IO, Any, ClassVar, Literal, NamedTuple, cast
+from typing import IO, Any, ClassVar, Literal, NamedTuple, TypeVar, cast
 from zipfile import ZipFile, ZipInfo
 
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, insert, or_, select
@@ -58,6 +58,7 @@ from skills.schemas.datasets import DatasetEpisode, DatasetEpisodes, DatasetIn
 from skills.schemas.results import DatasetResult
 from skills.settings import Settings
 
+Group = TypeVar("Group", int, str)
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once
 MARKED: tuple[Split, ...] = ("recovery", "failure")  # the splits of demonstrations that are marked so
 PROGRESS_S = 0.5  # progress is stored about so often, each time in a transaction
@@ -186,8 +187,8 @@ def _splits(chosen: Sequence[_Chosen], asked: DatasetIn) -> dict[int, Split]:
     for outcome in MARKED:  # of both, the failure counts
         split |= {episode[one.row]: outcome for one in chosen if one.outcome == outcome}
     groups = _groups(chosen, asked)
-    left = {episode[one.row]: f"{groups[one.row]:020}" for one in chosen if episode[one.row] not in split}
-    of_group = splits_by_surgeon(Counter(left.values()))
+    left = {episode[one.row]: groups[one.row] for one in chosen if episode[one.row] not in split}
+    of_group = splits_by_group(Counter(left.values()))
     split |= {at: of_group[group] for at, group in left.items()}
     return {one.row: split[episode[one.row]] for one in chosen}
 
@@ -301,15 +302,15 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         split_by=request.split,
         export=export,
     )
-    tell = jobs.progress_callback(database, request)
+    progress = jobs.progress_callback(database, request)
     with ExitStack() as opened:
         file = opened.enter_context(TemporaryFile())
         read = confined_reader(settings)
         with closing(read.server):  # it starts at the first recording that is not cached
             # Read once more than written: whether all episodes have setpoints is known after the last one.
-            rule = action_rule(_exported(database, read.parse, episodes, lambda _: tell(0.0)), about)
+            rule = action_rule(_exported(database, read.parse, episodes, lambda _: progress(0.0)), about)
             about = replace(about, action=rule)
-            exported = _exported(database, read.parse, episodes, tell)
+            exported = _exported(database, read.parse, episodes, progress)
             frames = write_dataset(file, exported, about, request.version, settings)
         size_bytes = file.tell()
         file.seek(0)
@@ -357,13 +358,13 @@ def _episodes(session: Session, job_row: int) -> list[_Episode]:
 
 
 def _exported(
-    database: Database, read: Parser, episodes: Sequence[_Episode], tell: Callable[[float], None]
+    database: Database, read: Parser, episodes: Sequence[_Episode], progress: Callable[[float], None]
 ) -> Iterator[ExportedEpisode]:
     """Read the recordings one after another, and yield their episodes."""
     at, recording, due_s = None, None, 0.0
     for number, episode in enumerate(episodes):
         if (now_s := monotonic()) >= due_s:
-            tell(number / (len(episodes) + 1))
+            progress(number / (len(episodes) + 1))
             due_s = now_s + PROGRESS_S
         if recording is None or at != episode.recording:
             recording = None  # before the next one is read, so that only one is in memory
@@ -482,20 +483,20 @@ def drop_exports(session: Session, job_rows: Sequence[int]) -> None:
             session.execute(statement, **UNSYNCHRONISED)
 
 
-def splits_by_surgeon(episodes: Mapping[str, int]) -> dict[str, Split]:
-    """Assign each surgeon to training, validation or test, so that nobody is in two of them.
+def splits_by_group(episodes: Mapping[Group, int]) -> dict[Group, Split]:
+    """Assign each group of episodes, such as all of a surgeon, to training, validation or test.
 
     Args:
-        episodes: Surgeons and their numbers of episodes.
+        episodes: The number of episodes of each group.
 
     Returns:
-        The split of each surgeon. The shares of the episodes approach `SHARES` as well as whole surgeons allow; one
-        surgeon alone is for training.
+        The split of each group. The shares of the episodes approach `SHARES` as well as whole groups allow; one group
+        alone is for training. Of equally large groups the first in their order is assigned first.
     """
     wanted: dict[Split, float] = {split: SHARES[split] * sum(episodes.values()) for split in SPLITS[:3]}
-    chosen: dict[str, Split] = {}
-    for surgeon, count in sorted(episodes.items(), key=lambda one: (-one[1], one[0])):
+    chosen: dict[Group, Split] = {}
+    for group, count in sorted(episodes.items(), key=lambda one: (-one[1], one[0])):
         split = max(SPLITS[:3], key=lambda split: wanted[split])
-        chosen[surgeon] = split
+        chosen[group] = split
         wanted[split] -= count
     return chosen

@@ -30,16 +30,7 @@ from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
-from skills.errors import (
-    BadInput,
-    Busy,
-    Conflict,
-    Corrupt,
-    SkillsError,
-    TooLarge,
-    UnknownFormat,
-    UnreadableRecording,
-)
+from skills.errors import BadInput, Busy, Conflict, Corrupt, SkillsError, TooLarge, UnknownFormat, UnreadableRecording
 from skills.formats import MEDIA_TYPES, media_type_of
 from skills.formats.parsed import ParsedContent, parse_recording
 from skills.formats.reader_process import ConfinedReader
@@ -228,7 +219,7 @@ def preview(upload: Upload, parse: Parser = parse_recording) -> described.Record
 
 
 def send_ahead(database: Database, upload: Upload) -> int | None:
-    """Store the chunks of a large upload before its row, in several short transactions, for which others can wait.
+    """Store the chunks of a large upload before its row, in several short transactions, between which others can write.
 
     They belong to nobody until `put_recording` stores the row; if it does not, they are deleted when they are due
     (`skills.library.operation.sweep`).
@@ -415,14 +406,14 @@ def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes
     Raises:
         Corrupt: The digest differs; the last chunk is then withheld.
     """
-    seen, held = hashlib.sha256(), b""
+    hasher, held = hashlib.sha256(), b""
     for data in session.scalars(chunks_of(stored.row).execution_options(yield_per=1)):
         # One chunk behind, so that the last one is only yielded after the digest was verified.
         if held:
             yield held
-        seen.update(data)
+        hasher.update(data)
         held = data
-    if seen.hexdigest() != stored.sha256:
+    if hasher.hexdigest() != stored.sha256:
         raise damaged()
     yield held
 
