@@ -22,7 +22,6 @@ from skills.formats.bag_writer import write_mcap
 from skills.formats.lerobot.cut import find_dataset
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.gridworld.scene import Scene
-from skills.jobs import Engine
 from skills.jobs.in_process import InProcess
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
@@ -47,9 +46,7 @@ def test_workers_start_for_batches_and_a_single_job_runs_in_the_process(
 
     monkeypatch.setattr("skills.serving.working", working)
     alone: list[Settings] = []
-    monkeypatch.setattr(
-        InProcess, "__init__", lambda self, given: (alone.append(given), Engine.__init__(self, given))[1]
-    )
+    monkeypatch.setattr(InProcess, "_run", lambda self: alone.append(self._settings))
     of_four = Settings(database_url=f"sqlite:///{tmp_path / 'skills.sqlite'}", workers=4)
     for given, workers in ((of_four, 0), (of_four, 1), (of_four, MANY), (of_four.model_copy(update={"workers": 0}), 1)):
         with connect(given, workers=workers):
