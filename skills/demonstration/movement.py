@@ -81,7 +81,8 @@ class Movement:
         """Return the angle between the orientations at two times in s; 0 if no orientation was recorded."""
         if self.rotation_xyzw is None:
             return 0.0
-        return angle_between(self.rotation_xyzw[self.index(start_s)], self.rotation_xyzw[self.index(end_s)])
+        first, last = (self.rotation_xyzw[self.index(second)] for second in (start_s, end_s))
+        return float(angle_of(multiplied(first * INVERSE, last)))
 
     def extent_mm(self, start_s: float, end_s: float) -> float:
         """Return the longest side of the box around the path between two times in s."""
@@ -264,19 +265,6 @@ def same_signs(rotation_xyzw: Floats) -> Floats:
     """
     flips = np.where((rotation_xyzw[1:] * rotation_xyzw[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(rotation_xyzw * np.append(1.0, np.cumprod(flips))[:, None])
-
-
-def angle_between(one_xyzw: Floats, other_xyzw: Floats) -> float:
-    """Return the angle between two orientations.
-
-    Args:
-        one_xyzw: Unit quaternion, shape (4,).
-        other_xyzw: Unit quaternion, shape (4,).
-
-    Returns:
-        The angle in rad, 0 to pi.
-    """
-    return float(angle_of(multiplied(one_xyzw * INVERSE, other_xyzw)))
 
 
 def _rate(grid_s: Floats, values: Floats) -> Floats:

@@ -335,6 +335,8 @@ def find_transfers(
 
 @dataclass(frozen=True)
 class _Overlap:
+    """A hold of the giver's jaw in which the taker's closes and which it outlasts; times in s since `origin_ns`."""
+
     giver: str
     taker: str
     held_s: float
@@ -345,6 +347,15 @@ class _Overlap:
 
 @dataclass(frozen=True)
 class _Observed:
+    """The motion of both tips around an overlap.
+
+    Attributes:
+        overlap: The overlap.
+        slip_mm: Change of the distance between the tips while both jaws are closed.
+        parted_mm: Greatest distance of the giver's tip from where it was at the release, in the time after it.
+        apart_mm: Mean distance between the tips while both jaws are closed; None if the arms share no frame.
+    """
+
     overlap: _Overlap
     slip_mm: float
     parted_mm: float
@@ -352,9 +363,11 @@ class _Observed:
 
     @property
     def pair(self) -> tuple[str, ...]:
+        """The names of both arms, sorted: the usual distance is that of a pair, whichever of them gives."""
         return tuple(sorted((self.overlap.giver, self.overlap.taker)))
 
     def judged(self, usual_mm: float | None) -> NeedleTransfer:
+        """Return it as a transfer with its confidence, given the usual distance between the tips of this pair."""
         one = self.overlap
         deviation_mm = 0.0 if self.apart_mm is None or usual_mm is None else abs(self.apart_mm - usual_mm)
         seen = (1.0, self.slip_mm, min(self.parted_mm, PARTED_MM), deviation_mm)

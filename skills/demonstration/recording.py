@@ -42,7 +42,7 @@ from skills.remedies import did_you_mean
 BASES_LIMIT = 64  # ours: pairs of motions of one arm in two frames; a dVRK's recording has one or two per arm
 PAIR_NS = 2_000_000  # ours: between two poses so near in time a tip at 100 mm/s moves by 0.2 mm
 PAIRS_LEAST = 10  # ours: from fewer pairs it cannot be concluded that a base stood still
-IDENTIFIED_LIMIT = 16  # ours: pairs of joints and poses that are compared, each for 0.1 s; a dVRK has two per arm
+IDENTIFIED_LIMIT = 16  # ours: pairs of joints and poses that are compared, 0.1 s each; a dVRK has two per arm
 JOINT_GAP_NS = 50_000_000  # ours: joints further apart in time are not interpolated
 WIDE_MM = 2.0  # ours: a rotation cannot be fitted to tips that move less than this in a second direction
 
@@ -97,7 +97,7 @@ def identified_arms(
 
     Args:
         motions: Poses; those that were computed from joints are left out.
-        joints: Measured joints. Of more than `IDENTIFIED_LIMIT` pairs of an arm only the first are compared.
+        joints: Measured joints. Of more than `IDENTIFIED_LIMIT` pairs, of all arms together, the first are compared.
         tools: Arm and its stated instrument.
         timed: Whether the stamps are times that were recorded, so that speeds can be computed from them.
     """

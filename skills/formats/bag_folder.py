@@ -11,7 +11,6 @@ dataset (see `lerobot`), or one JIGSAWS trial.
 
 The bag is in one folder, anywhere in the archive. The messages of a bag in several files are merged by their log time.
 If there is a `metadata.yaml`, it must name exactly these files and count exactly these messages.
-
 """
 
 import re

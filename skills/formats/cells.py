@@ -474,8 +474,8 @@ def _since_1970(date: re.Match[str], ns_per_unit: int) -> str:
     return f"{Decimal(since_ns) / ns_per_unit:f}"
 
 
-def _check_digits(names: Sequence[str], column: int, cells: list[str], line: int = _FIRST_ROW) -> None:
-    """Refuse times that lost their digits, such as 1.76E+09, because they would repeat.
+def _check_digits(names: Sequence[str], column: int, cells: list[str]) -> None:
+    """Refuse times of the first row that lost their digits, such as 1.76E+09, because they would repeat.
 
     Raises:
         UnreadableRecording: A time of ten digits or more has fewer, and an exponent.
@@ -484,8 +484,8 @@ def _check_digits(names: Sequence[str], column: int, cells: list[str], line: int
     mantissa, mark, exponent = cell.lower().partition("e")
     if mark and is_number(cell) and abs(float(exponent)) > sum(letter.isdigit() for letter in mantissa) - 1 >= 0:
         raise UnreadableRecording(
-            f"Row {line}, column {names[column]}: {cell[:40]!r} has lost its last digits, in a spreadsheet or as a "
-            "float. Export the times with all digits, as whole numbers or as text."
+            f"Row {_FIRST_ROW}, column {names[column]}: {cell[:40]!r} has lost its last digits, in a spreadsheet or as "
+            "a float. Export the times with all digits, as whole numbers or as text."
         )
 
 

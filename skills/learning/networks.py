@@ -173,9 +173,8 @@ class Space:
         Returns:
             The lengths s and the distances u of the module's docstring, both of shape (N,), in cells.
         """
-        cells = (
-            np.asarray(positions_mm, float)[:, None] - self.path.tip_mm[:-1]
-        ) / self.path.grid.cell_mm  # (N, R - 1, 3)
+        from_mm = np.asarray(positions_mm, float)[:, None] - self.path.tip_mm[:-1]  # (N, R - 1, 3)
+        cells = from_mm / self.path.grid.cell_mm
         share = np.clip((cells * self._legs).sum(axis=-1) / self._lengths**2, 0.0, 1.0)
         off = np.linalg.norm(cells - share[..., None] * self._legs, axis=-1)
         # Rounded, so that distances that differ by a rounding error count as equal.

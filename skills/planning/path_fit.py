@@ -1,6 +1,6 @@
 """Smooth paths along the raw demonstration, inside a rollout's cells, and the hand along them.
 
-    Demo, GridPath --trace--> Trace;   Rollout, Trace, start --fit_to_demo--> FittedPath
+    Demo, GridPath --trace--> SmoothedDemo;   Rollout, SmoothedDemo, start --fit_to_demo--> FittedPath
 
 The grid rounds a demonstration to the centres of its cells, half a cell away (h / 2 in 3-D) on average. The recording
 has the surgeon's actual place in each cell. All of this is ours; the paper drives from centre to centre.
@@ -302,7 +302,10 @@ def _touching(at: Floats, visits: Ints, cells: Ints) -> tuple[Floats, Ints]:
 
 
 def _smoothest(wanted: Floats, low: Floats, high: Floats, stiffness: float) -> Floats:
-    """Solve the minimisation above for points, (K, 3), within boxes, by Nesterov's accelerated projected gradient."""
+    """Solve the minimisation of the module's docstring for points within boxes, all of shape (K, 3).
+
+    By Nesterov's accelerated projected gradient.
+    """
     rate = 1 / (1 + 16 * stiffness)  # 1 over the largest curvature of the objective; the smallest is 1
     push = (1 - np.sqrt(rate)) / (1 + np.sqrt(rate))
     x = ahead = wanted.clip(low, high)
@@ -375,16 +378,10 @@ class Hand:
             Positions of the tip, mm, shape (count, 3); rotations [n o a], shape (count, 3, 3), or None; and angles of
             the jaw, shape (count,), or None.
         """
-        turned = None
-        if self.rotation_xyzw is not None:
-            quaternions = self._between(same_signs(self.rotation_xyzw), count)
-            turned = matrix_of(quaternions)
-        jaw = self.jaw_rad
-        return (
-            self._between(self.tip_mm, count),
-            turned,
-            None if jaw is None else self._between(jaw, count).clip(jaw.min(), jaw.max()),
-        )
+        seen, jaw = self.rotation_xyzw, self.jaw_rad
+        turned = None if seen is None else matrix_of(self._between(same_signs(seen), count))
+        opened = None if jaw is None else self._between(jaw, count).clip(jaw.min(), jaw.max())
+        return self._between(self.tip_mm, count), turned, opened
 
     def _between(self, values: Floats, count: int) -> Floats:
         from scipy.interpolate import CubicSpline  # here, because clients read plans without it
@@ -413,22 +410,26 @@ def hand_along(demo: Demo, fitted: FittedPath, *, turning: bool) -> Hand:
     times = times[(times >= clock_s[0]) & (times <= clock_s[-1])]
     recorded_s = np.maximum(times, joins_s)  # during the approach the jaw is as where the path joins
     points = np.arange(len(fitted.tip_mm), dtype=np.float64)
-    grid_s, tip_mm = _calm(times, interpolated(np.interp(times, clock_s, places), points, fitted.tip_mm), TREMOR_S)
+    grid_s, tip_mm = _calm(times, interpolated(np.interp(times, clock_s, places), points, fitted.tip_mm))
     turned, opened = None, None
     if turning and demo.rotation_xyzw is not None:
-        _, turned = _calm(times, interpolated(recorded_s, demo.stamps_s, same_signs(demo.rotation_xyzw)), TREMOR_S)
+        _, turned = _calm(times, interpolated(recorded_s, demo.stamps_s, same_signs(demo.rotation_xyzw)))
         turned = unit(turned)
     if (jaw := jaw_within(demo)) is not None:
-        opened = _calm(times, np.interp(recorded_s, demo.stamps_s, jaw)[:, None], TREMOR_S)[1][:, 0]
+        opened = _calm(times, np.interp(recorded_s, demo.stamps_s, jaw)[:, None])[1][:, 0]
     off_mm = _off_mm(tip_mm, fitted.tip_mm, np.interp(grid_s, clock_s, places))
     return Hand((grid_s - grid_s[0]).round(9), tip_mm, off_mm, turned, opened)
 
 
-def _calm(seconds: Floats, values: Floats, window_s: float) -> tuple[Floats, Floats]:
-    """Average values, (T, N), of a hand that rests before and after, at even times; first and last are exact."""
+def _calm(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Average values, (T, N), of a hand that rests before and after, over `TREMOR_S`; first and last are exact.
+
+    Returns:
+        Even times, (M,), from half a window before the first to half a window after the last, and the means, (M, N).
+    """
     half_s = TREMOR_S / 2
     rested_s = np.concatenate(([seconds[0] - half_s], seconds, [seconds[-1] + half_s]))
-    grid_s, calm = smoothed_tip(rested_s, np.concatenate((values[:1], values, values[-1:])), window_s)
+    grid_s, calm = smoothed_tip(rested_s, np.concatenate((values[:1], values, values[-1:])), TREMOR_S)
     calm[[0, -1]] = values[[0, -1]]  # without the window's round-off
     return grid_s, calm.round(9)  # so that every machine computes the same bytes
 

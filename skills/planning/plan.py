@@ -7,10 +7,9 @@ One learnt policy serves many passes (Sec. IV, Fig. 7).
 A pass moves the complete grid world so that the policy's *goal* lies at the suture point, turned about it if the point
 has a rotation. In the moved grid the policy is rolled out from the pass's start. The result is a path in the arm's
 frame: through the centres of its cells, as in the paper, or, if the demonstration is given, fitted to the recording
-within the same cells (`skills.planning.path_fit`), with the surgeon's orientation, jaw and tempo along it
-(`skills.planning.path_fit`). What was demonstrated at the policy's goal is then done at the suture point: the hand's
-last sample lies there, somewhere in the cell of the goal. Between passes the surgeon inserts and grasps the needle by
-hand (M1, M2).
+within the same cells, with the surgeon's orientation, jaw and tempo along it (`skills.planning.path_fit`). What was
+demonstrated at the policy's goal is then done at the suture point: the hand's last sample lies there, somewhere in the
+cell of the goal. Between passes the surgeon inserts and grasps the needle by hand (M1, M2).
 
 The orientation turns with the pass. It is held as at the first sample where that is requested, and the plan then states
 its *departure* from the recorded one. A2 ends in the recorded hand-off, the poses of both arms moved with the pass, if
@@ -69,8 +68,6 @@ Orientation = Literal["recorded", "demonstrated", "assumed tool-down"]
 Turning = Literal["recorded", "constant"]
 A2Target = Literal["recorded", "paper"]
 PathKind = Literal["fitted", "cell centres"]
-
-
 STEP_MM = 0.1  # greatest distance between samples: that of a plan at the default 20 mm/s and 200 Hz
 
 

@@ -121,11 +121,11 @@ class Sheet:
             fill = (*colour, round(255 * alpha))
             self._pen.line(where[begin : end + 1], fill=fill, width=round(width * self._camera.scale), joint="curve")
 
-    def dots(self, places: Floats, colour: Colour, radius: float = 2.6, strength: float = 1.0) -> None:
-        """Draw dots, pale behind surfaces."""
+    def dots(self, places: Floats, colour: Colour) -> None:
+        """Draw dots at places, shape (K, 3), pale behind surfaces."""
         pixels, hidden = self._project(places)
         for pixel, pale in zip(pixels, hidden.tolist(), strict=True):
-            self._dot(pixel, radius, (*colour, round(255 * strength * (0.35 if pale else 1.0))))
+            self._dot(pixel, 2.6, (*colour, round(255 * (0.35 if pale else 1.0))))
 
     def label(self, place: Floats, colour: Colour, text: str, size: float = 10.0) -> None:
         """Draw a short text on a disc with a white rim, in front of everything."""
@@ -193,9 +193,9 @@ def colour_of(number: int) -> Colour:
     return PASS_COLOURS[number % len(PASS_COLOURS)]
 
 
-def thinned(path: Floats, most: int = 400) -> Floats:
-    """Return at most so many points of a path, its ends among them."""
-    kept = np.unique(np.linspace(0, len(path) - 1, min(len(path), most)).round().astype(int))
+def thinned(path: Floats) -> Floats:
+    """Return at most 400 points of a path, shape (K, 3), its ends among them."""
+    kept = np.unique(np.linspace(0, len(path) - 1, min(len(path), 400)).round().astype(int))
     return np.asarray(path[kept])
 
 

@@ -186,12 +186,6 @@ class Simulator:
 
     # -- measurements and motion --
 
-    def read_joints(self) -> list[float]:
-        """Return PSM_A's joints, rad and mm."""
-        values = [float(state[0]) for state in self.joint_states()]
-        values[INSERTION] /= MM
-        return values
-
     def joint_states(self) -> Any:
         """Return PSM_A's joint states in PyBullet's form: position, speed, reaction, effort of each."""
         return self.bullet.getJointStates(self.arm.number, self.arm.joints)
