@@ -37,7 +37,7 @@ from skills.arithmetic import product
 from skills.arrays import Floats, Ints, freeze, frozen, interpolated
 from skills.compiled import compiled, inner
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.movement import smoothed_tip
+from skills.demonstration.movement import lengths_along, smoothed_tip
 from skills.errors import BadInput, BadPath
 from skills.learning.evaluation import dtw
 
@@ -87,7 +87,7 @@ def resampled(tip_mm: Floats, states: int = STATES) -> Floats:
         tip_mm: The path, shape (T, 3).
         states: Number of points, the ends included.
     """
-    along_mm = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    along_mm = lengths_along(tip_mm)
     at_mm = np.linspace(0.0, along_mm[-1], states)
     return interpolated(at_mm, along_mm, tip_mm)
 

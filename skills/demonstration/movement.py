@@ -152,6 +152,18 @@ def smoothed_tip(seconds: Floats, tip_mm: Floats, window_s: float) -> tuple[Floa
     return grid_s, np.asarray(smooth)
 
 
+def lengths_along(points: Floats) -> Floats:
+    """Return the length of a path from its first point to each of its points.
+
+    Args:
+        points: The path, shape (T, 3), in any unit.
+
+    Returns:
+        Lengths in that unit, shape (T,), from 0.
+    """
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+
+
 def spans_of(seconds: Floats, on: Flags) -> list[Span]:
     """Return the intervals in which a condition holds, each from its first sample to its last.
 

@@ -35,7 +35,6 @@ from skills.fields import Point, Quaternion, computed_field, schema
 from skills.kinematics import INSTRUMENTS, matrix_of
 
 NEAR_MM = 40.0  # between tips that hold one needle: 26 mm along its arc, 17 mm across, plus the width of the jaws
-STEADY_MM, STEADY_RAD = 3.0, 0.05  # a base that moved more in the other frame has no single pose
 APART_S = 0.1  # a pose further away in time is not used
 
 
@@ -170,7 +169,7 @@ def in_base(partner: Partner, base: BaseFrame, bases: Sequence[BaseFrame]) -> Pa
         bases: Result of `base_frames` for the recording.
     """
     position, rotation = _seen_from(base, np.array(partner.position_mm), np.array(partner.rotation_xyzw))
-    base_mm, base_xyzw = _other_base(base, partner.arm, bases) if _is_steady(base) else (None, None)
+    base_mm, base_xyzw = _other_base(base, partner.arm, bases) if base.is_steady else (None, None)
     position_mm, rotation_xyzw = xyz(position), xyzw(rotation)
     return replace(partner, position_mm=position_mm, rotation_xyzw=rotation_xyzw, base_mm=base_mm, base_xyzw=base_xyzw)
 
@@ -194,7 +193,7 @@ def pose_at(recording: Recording, motion: Motion, second: float) -> int | None:
 def _base_of(motion: Motion, bases: Sequence[BaseFrame]) -> BaseFrame | None:
     """Return the base of a local motion's arm in the frame of its other poses; None unless it stood still there."""
     for one in bases:
-        if (one.arm, one.local_frame) == (motion.arm, motion.frame) and motion.is_local and _is_steady(one):
+        if (one.arm, one.local_frame) == (motion.arm, motion.frame) and motion.is_local and one.is_steady:
             return one
     return None
 
@@ -202,14 +201,10 @@ def _base_of(motion: Motion, bases: Sequence[BaseFrame]) -> BaseFrame | None:
 def _other_base(base: BaseFrame, arm: str, bases: Sequence[BaseFrame]) -> tuple[Point, Quaternion] | tuple[None, None]:
     """Return the pose of another arm's base in this arm's base; None unless both stood still in one common frame."""
     for one in bases:
-        if (one.arm, one.frame) == (arm, base.frame) and _is_steady(one):
+        if (one.arm, one.frame) == (arm, base.frame) and one.is_steady:
             position, rotation = _seen_from(base, np.array(one.position_mm), np.array(one.rotation_xyzw))
             return xyz(position), xyzw(rotation)
     return None, None
-
-
-def _is_steady(base: BaseFrame) -> bool:
-    return base.spread_mm <= STEADY_MM and base.spread_rad <= STEADY_RAD
 
 
 def _instrument_of(recording: Recording, arm: str) -> str | None:

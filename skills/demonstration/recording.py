@@ -44,6 +44,7 @@ PAIR_NS = 2_000_000  # ours: between two poses so near in time a tip at 100 mm/s
 PAIRS_LEAST = 10  # ours: from fewer pairs it cannot be concluded that a base stood still
 IDENTIFIED_LIMIT = 16  # ours: pairs of joints and poses that are compared, 0.1 s each; a dVRK has two per arm
 JOINT_GAP_NS = 50_000_000  # ours: joints further apart in time are not interpolated
+STEADY_MM, STEADY_RAD = 3.0, 0.05  # ours: a base that moved more in the other frame has no single pose
 WIDE_MM = 2.0  # ours: a rotation cannot be fitted to tips that move less than this in a second direction
 
 
@@ -70,6 +71,11 @@ class BaseFrame:
     rotation_xyzw: Quaternion
     spread_mm: float
     spread_rad: float
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the base stood still in `frame`."""
+        return self.spread_mm <= STEADY_MM and self.spread_rad <= STEADY_RAD
 
     def is_of(self, motion: Motion) -> bool:
         """Return whether it is the base of a motion's arm in the frame of that motion."""

@@ -58,7 +58,6 @@ from skills.kinematics import INSERTION
 from skills.remedies import Action, Remedy
 
 TIME = "timestamp"
-STEADY_MM, STEADY_RAD = 3.0, 0.05  # as of `skills.demonstration.partner`: a base that moves more has no single pose
 _FIRST = re.compile(r"psm\d+_(pose\.position\.x|(measured_)?js\[0\])")
 _USED = re.compile(
     r"(?P<arm>psm\d+)_((?P<pose>pose|rcm_pose|sp)\.(?P<part>position\.[xyz]|orientation\.[xyzw])"
@@ -305,6 +304,6 @@ def _local(arm: str, stamps_ns: Ints, pose: Parts, seen: recording.Motion | None
     if seen is None:
         raise MixedFrames("The arm has no other pose that would show whether it is the tip in the arm's base.")
     bases = recording.base_frames(recording.Recording("csv", "none", (local, replace(seen, frame="other"))))
-    if not bases or bases[0].spread_mm > STEADY_MM or bases[0].spread_rad > STEADY_RAD:
+    if not (bases and bases[0].is_steady):
         raise MixedFrames("No fixed transform leads from it to the arm's other pose, so its frame is not known.")
     return local

@@ -55,7 +55,7 @@ import numpy as np
 from skills.arithmetic import product
 from skills.arrays import Flags, Floats, Ints, freeze, interpolated
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.movement import same_signs, smoothed_tip
+from skills.demonstration.movement import lengths_along, same_signs, smoothed_tip
 from skills.errors import BadPlan
 from skills.gridworld.grid import GridPath
 from skills.kinematics import instrument_of, matrix_of, quaternion_of
@@ -177,7 +177,7 @@ def fit_to_demo(followed: Rollout, demonstrated: SmoothedDemo, start_mm: Floats 
     """
     assert followed.finished and np.array_equal(followed.path.states, demonstrated.path.states)
     guide, visits, clock_s = _guide(followed, demonstrated, start_mm)
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1)))
+    along = lengths_along(guide)
     if along[-1] == 0:
         return FittedPath(guide[:1], visits[:1], clock_s[[0, -1]], np.zeros(2))
     grid, cell_mm = followed.path.grid, followed.path.grid.cell_mm
@@ -254,7 +254,7 @@ def _nearest(tip_mm: Floats, of_visit: Flags, place_mm: Floats) -> int:
 
 def _blended(tip_mm: Floats, place_mm: Floats, over_mm: float) -> Floats:
     """Return a path, (M, 3), that begins at a place and joins the original path over a length."""
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    along = lengths_along(tip_mm)
     share = np.minimum(along / over_mm, 1.0)[:, None]
     blended: Floats = tip_mm + (place_mm - tip_mm[0]) * (1 - share * share * (3 - 2 * share))
     return blended
@@ -439,7 +439,7 @@ def _clock(fitted: FittedPath) -> tuple[float, Floats, Floats]:
 
     The approach has the mean speed of what is followed after it.
     """
-    way_mm = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(fitted.tip_mm, axis=0), axis=1)))
+    way_mm = lengths_along(fitted.tip_mm)
     joins_s = float(fitted.clock_s[0])
     joined = int(np.flatnonzero(fitted.clock_s == joins_s)[-1])  # the approach is all at one time
     clock_s, places = fitted.clock_s[joined:], fitted.places[joined:]
@@ -535,5 +535,5 @@ def styled(followed: Demo, demos: Sequence[Demo]) -> Demo:
 
 def _shares(tip_mm: Floats) -> Floats:
     """Return the part of a path's length up to each point, (T,), from 0 to 1."""
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    along = lengths_along(tip_mm)
     return np.asarray(along / along[-1])

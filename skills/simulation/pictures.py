@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from skills.arrays import Flags, Floats, Ints
+from skills.demonstration.movement import lengths_along
 from skills.kinematics import JOINTS, UNITS, instrument_of, matrix_of
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
@@ -201,7 +202,7 @@ def thinned(path: Floats) -> Floats:
 
 def stepping_stones(path: Floats) -> Floats:
     """Return a point of a path every 5 mm of its length."""
-    walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    walked = lengths_along(path)
     at = np.searchsorted(walked, np.arange(0.0, walked[-1] + 1e-9, _DOT_EVERY_M))
     return np.asarray(path[np.unique(np.minimum(at, len(path) - 1))])
 
@@ -341,14 +342,11 @@ def _outline(begin: Floats, end: Floats, radius: float) -> Floats:
 def _between_axes(one: tuple[Floats, Floats, float], other: tuple[Floats, Floats, float]) -> tuple[Floats, Floats]:
     """Return the nearest points of two capsules' surfaces, as exactly as a line is drawn."""
     share = np.linspace(0.0, 1.0, 201)[:, None]
-    (p, q), (radius, other_radius) = (
-        (begin + share * (end - begin) for begin, end, _ in (one, other)),
-        (one[2], other[2]),
-    )
+    p, q = (begin + share * (end - begin) for begin, end, _ in (one, other))
     apart = np.linalg.norm(p[:, None] - q, axis=2)
     i, j = np.unravel_index(int(apart.argmin()), apart.shape)
     way = (q[j] - p[i]) / max(float(apart[i, j]), 1e-9)
-    return p[i] + radius * way, q[j] - other_radius * way
+    return p[i] + one[2] * way, q[j] - other[2] * way
 
 
 def png(figure: "Figure") -> bytes:

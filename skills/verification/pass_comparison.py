@@ -11,6 +11,7 @@ from math import ceil, nan
 import numpy as np
 
 from skills.arrays import Flags, Floats, Ints
+from skills.demonstration.movement import lengths_along
 from skills.kinematics import instrument_of, matrix_of
 from skills.learning.policy import rollout
 from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, NEEDLE_RADIUS_MM, TAKEN_MM
@@ -46,7 +47,7 @@ def _off_line_mm(tip_mm: Floats, line: Floats) -> Floats:
     off = np.linalg.norm(tip_mm[:, None] - begin - part[..., None] * along, axis=2)
     nearest = off.min(axis=1)
     near, reached = off <= nearest[:, None] + 0.05, np.append(0.0, np.cumsum(lengths)[:-1]) + part * lengths
-    gone = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    gone = lengths_along(tip_mm)
     # Where the line crosses itself the first place counts at the beginning, and then the last one, so that going on is
     # never taken for going back.
     begun, come = np.where(near, reached, np.inf)[0].min(), np.where(near, reached, -np.inf).max(axis=1)
@@ -380,6 +381,7 @@ class PassComparison:
         for arm in (self.arm, self.other):
             if arm is not None:
                 speed, rate = _rates(arm, rows)
+                # 45 degrees per second: the greatest rate of a jaw in A2 and transfers
                 active = np.maximum(active, np.maximum(speed / self.request.speed_mm_s, rate / 45.0))
         allowed_s = STAND_S / 2 + BETWEEN_SHARE * len(rows) / self.rate_hz
         still = active <= STILL * active.max(initial=0.0)
@@ -429,7 +431,7 @@ def _off_cells(places: Floats, cells: Ints, reach: float) -> Floats:
         reach: How far from its centre a cell reaches: half of it, and as far as hysteresis lets a recording leave it.
     """
     limit, number = LIMITS["path off the policy's cells"][1], np.arange(len(cells))
-    moved = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    moved = lengths_along(places)
     _, looked = np.unique((moved / CELL_STEP).astype(np.int64), return_index=True)
     looked = np.union1d(looked, [len(places) - 1])
     off = np.zeros(len(places))

@@ -28,8 +28,7 @@ from numpy.typing import ArrayLike
 from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo, partner_motion
 from skills.demonstration.movement import press_times, same_signs, smoothed_speed
-from skills.demonstration.partner import STEADY_MM
-from skills.demonstration.recording import Motion, Recording
+from skills.demonstration.recording import STEADY_MM, Motion, Recording
 from skills.fields import Column, Count, schema
 from skills.kinematics import INSTRUMENTS, matrix_of, quaternion_of
 from skills.planning.motion_laws import PHASES
@@ -321,6 +320,7 @@ def timeline_of_demo(recording: Recording, demo: Demo) -> Timeline:
 
 
 def _rate_hz(motions: Sequence[Motion]) -> float:
+    """Return the highest rate of the motions, from the median steps of their stamps; 1 if none has two samples."""
     return max((1e9 / float(np.median(np.diff(m.stamps_ns))) for m in motions if len(m.stamps_ns) > 1), default=1.0)
 
 
@@ -347,6 +347,7 @@ def _signals(recording: Recording, arm: str) -> tuple[_Samples | None, _Samples 
 
 
 def _base(recording: Recording, motion: Motion) -> _Base | None:
+    """Return the base of a motion's arm in the motion's frame; None if its place is not known or it moved."""
     if motion.states_base:
         return np.eye(3), np.zeros(3)
     for base in recording.bases:

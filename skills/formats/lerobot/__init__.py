@@ -30,10 +30,8 @@ from skills.errors import BadColumns, UnreadableRecording
 from skills.formats.archive import printable, shown
 from skills.formats.lerobot.parquet import ParquetColumn, open_parquet, read_rows
 
-INFO, STATEMENTS, EPISODE_LINES, TASK_LINES, TASK_TABLE = (
-    *("meta/info.json", "meta/suture-skills.json", "meta/episodes.jsonl"),
-    *("meta/tasks.jsonl", "meta/tasks.parquet"),
-)
+INFO, STATEMENTS, EPISODE_LINES = "meta/info.json", "meta/suture-skills.json", "meta/episodes.jsonl"
+TASK_LINES, TASK_TABLE = "meta/tasks.jsonl", "meta/tasks.parquet"
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 JSON_CHARACTERS = 4 << 20  # the metadata of 100 features have 20,000
 NUMBERS = 5000  # of all features together
