@@ -156,6 +156,7 @@ def distances_of(shapes: ArrayLike, pairs: ArrayLike) -> Floats:
 
 
 def _measured(paths: Floats, references: Floats, pairs: Ints) -> Floats:
+    """Return the distance between a path, (N, T, 3), and a reference, (M, R, 3), of each pair, (K, 2): shape (K,)."""
     chosen = frozen(pairs, np.int64, (None, 2), "pairs")
     totals = np.empty(len(chosen))
 
@@ -301,6 +302,7 @@ class Difference:
 
     @property
     def _most(self) -> tuple[int, int]:
+        """The third of the path and the axis with the largest share, as indices."""
         part, axis = np.unravel_index(int(self.shares.argmax()), self.shares.shape)
         return int(part), int(axis)
 

@@ -273,6 +273,11 @@ def _segment_ns(recording: Recording, motion: Motion, start_s: float | None, end
 
 
 def _check_extent(topic: str, tip_mm: Floats) -> None:
+    """Refuse positions, (T, 3), whose extent along every axis is below, or along one above, `EXTENT_LIMITS_MM`.
+
+    Raises:
+        NotMetres: It is.
+    """
     extent_mm = float(np.ptp(tip_mm, axis=0).max())
     least, most = EXTENT_LIMITS_MM
     if least <= extent_mm <= most:

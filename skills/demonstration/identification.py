@@ -188,10 +188,12 @@ class _Fit:
 
     @property
     def residual_mm(self) -> float:
+        """Root mean square of the distances."""
         return float(np.sqrt((self.away_mm**2).mean()))
 
     @property
     def is_good(self) -> bool:
+        """Whether the hypothesis explains positions and orientations."""
         # NaN is not good.
         return self.residual_mm <= FIT_MM and self.residual_rad <= FIT_RAD
 
@@ -261,6 +263,7 @@ def identify(
 
 
 def _fits(poses: _Poses) -> Iterator[_Fit]:
+    """Yield every hypothesis with the transform that fits it best."""
     for one in hypotheses.HYPOTHESES:
         yield _fit(poses, one)
 
@@ -421,6 +424,7 @@ def _is_identity(fit: _Fit) -> bool:
 
 
 def _describe_candidates(found: Identification) -> str:
+    """Return the first four candidates and the number of the others, in words."""
     shown = ", ".join(found.candidates[:4])
     more = len(found.candidates) - 4
     return f"{shown} and {more} more" if more > 0 else shown or "no arm whose joints reach so far"

@@ -158,6 +158,7 @@ def pieces_of(demo: Demo) -> list[slice]:
 
 
 def _movement(demo: Demo, piece: slice) -> Movement:
+    """Return the smoothed motion of some of the samples."""
     rotation = None if demo.rotation_xyzw is None else demo.rotation_xyzw[piece]
     return movement_of(demo.stamps_s[piece], demo.tip_mm[piece], rotation)
 

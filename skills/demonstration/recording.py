@@ -474,6 +474,7 @@ def preference(motion: Motion) -> tuple[int, str]:
 
 
 def _listed(topics: tuple[Topic, ...]) -> str:
+    """Return a sentence with the first 20 topics; nothing if there are none."""
     if not topics:
         return ""
     return " It has " + ", ".join(f"{topic.name} ({topic.type})" for topic in topics[:20]) + "."

@@ -207,6 +207,7 @@ def read_one(file: BinaryIO) -> Recording:
 
 
 def _read_bag(archive: Archive, names: list[str], bag: list[str]) -> Recording:
+    """Read the files of the one bag in an archive, with the tags beside them; raises as `read_zip`."""
     folders = sorted({str(PurePosixPath(name).parent) for name in bag})
     suffixes = sorted({suffix_of(name) for name in bag})
     if len(folders) > 1 or len(suffixes) > 1 or len(bag) > FILES:
@@ -256,6 +257,7 @@ def _read_mcaps(archive: Archive, names: list[str]) -> Recording:
 
 
 def _each(archive: Archive, names: Iterable[str]) -> Iterator[BinaryIO]:
+    """Yield the files one after the other, each unpacked while it is used."""
     for name in names:
         with _plain(archive, name) as file:
             yield file
@@ -263,6 +265,7 @@ def _each(archive: Archive, names: Iterable[str]) -> Iterator[BinaryIO]:
 
 @contextmanager
 def _plain(archive: Archive, name: str) -> Iterator[BinaryIO]:
+    """Unpack a file, and decompress it if rosbag2 compressed it as a whole."""
     with archive.unpacked(name) as file:
         if not suffix_of(name).endswith(".zstd"):
             yield file
@@ -286,6 +289,7 @@ def _tags(archive: Archive, names: list[str]) -> Iterator[tuple[str, str]]:
 
 
 def _read_trial(archive: Archive, names: list[str]) -> Recording:
+    """Read the one JIGSAWS trial among texts, with its transcription and ratings; raises as `read_zip`."""
     if len(names) > TEXTS:
         raise UnreadableRecording(
             f"The archive has {len(names)} text files; send one trial with its transcription at a time.",

@@ -191,6 +191,7 @@ def _doubled(name: str) -> BadColumns:
 def _columns(
     names: Sequence[str], groups: Mapping[Quantity, Indices], time: int | None
 ) -> tuple[recording.Column, ...]:
+    """Return all columns of the header, each with what it was read as."""
     meant = {} if time is None else {time: ("t", "ns")}
     for (arm, kind), columns in groups.items():
         for index, part in zip(columns, _PARTS.get(kind, _POSE), strict=True):
@@ -200,6 +201,7 @@ def _columns(
 
 
 def _check_whole(times: Floats) -> None:
+    """Refuse times that are not whole nanoseconds."""
     if (times != np.rint(times)).any():
         raise BadColumns(
             f"The column {TIME} is not in whole nanoseconds, which this format has; in which unit is it? Name "
@@ -215,6 +217,7 @@ def _recording(
     columns: tuple[recording.Column, ...],
     faults: Mapping[str, str],
 ) -> recording.Recording:
+    """Return the recording of the numbers of each quantity; raises as `read_ee_csv`."""
     motions: list[recording.Motion] = []
     joints: list[recording.Joints] = []
     jaws: list[tuple[str, recording.Signal]] = []

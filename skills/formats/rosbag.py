@@ -82,6 +82,7 @@ def guard(connection: apsw.Connection) -> None:
 
 
 def _limit_steps(connection: apsw.Connection, steps: int) -> None:
+    """Interrupt all queries of a connection once they have used so many steps together."""
     left = steps
 
     def over() -> bool:
@@ -113,6 +114,7 @@ def _check_objects(connection: apsw.Connection) -> None:
 
 
 def _check_profiles(connection: apsw.Connection) -> None:
+    """Refuse more topics, or longer quality-of-service profiles, than a recorder writes."""
     columns = [column[1] for column in connection.pragma("table_xinfo", "topics") or ()]
     profiles = "total(length(offered_qos_profiles))" if "offered_qos_profiles" in columns else "0"
     ((count, characters),) = connection.execute(f"SELECT count(*), {profiles} FROM topics")  # noqa: S608 - ours
@@ -125,6 +127,7 @@ def _check_profiles(connection: apsw.Connection) -> None:
 
 
 def _foreign(kind: str, name: object) -> UnreadableRecording:
+    """Return the error for an object that rosbag2 does not write."""
     return UnreadableRecording(
         f"The SQLite bag (.db3) has a {kind} {printable(name)!r}, which rosbag2 does not write. {_ADVICE}",
         kind=kind,
@@ -132,6 +135,7 @@ def _foreign(kind: str, name: object) -> UnreadableRecording:
 
 
 def _allowed(action: int, one: str | None, other: str | None, _schema: str | None, _inner: str | None) -> int:
+    """Authorize the statements of rosbags, and deny all others: SQLite's authorizer callback."""
     fine = (
         action == apsw.SQLITE_SELECT
         or (action == apsw.SQLITE_READ and one in TABLES | {"sqlite_master", "sqlite_schema"})
@@ -318,6 +322,7 @@ def ros2_types() -> "Typestore":
 
 @contextmanager
 def _reading(paths: Sequence[Path]) -> "Iterator[AnyReader]":
+    """Open a recording with rosbags; raises `UnreadableRecording` if it cannot."""
     advice = "Copy it again, or convert it with `ros2 bag convert` or `rosbags-convert`."
     what = f"The {_NAMES.get(paths[0].suffix, 'bag')}"
     for path in paths:
@@ -344,6 +349,7 @@ def _check_indexed(head: bytes) -> None:
 
 
 def _convert(reader: "AnyReader", out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
+    """Write the used messages as MCAP, and return all topics; raises as `convert`."""
     here = _topics(reader)
     if not any(topics.arm_of_pose(topic.name, topic.type) for topic in here):
         said = ", ".join(f"{topic.name} ({topic.type})" for topic in here[:20])
@@ -356,6 +362,7 @@ def _convert(reader: "AnyReader", out: IO[bytes], notes: dict[str, str] | None =
 
 
 def _topics(reader: "AnyReader") -> tuple[Topic, ...]:
+    """Return the topics of an open recording, with the numbers of their messages."""
     counts: Counter[tuple[str, str]] = Counter()
     for connection in reader.connections:
         counts[connection.topic, connection.msgtype] += connection.msgcount

@@ -470,6 +470,7 @@ def _calming(
 
 
 def _about_the_papers_grid(outside: float, path: GridPath) -> tuple[str, ...]:
+    """Return the advice that the samples are not all in the paper's grid."""
     size = " x ".join(f"{count}" for count in path.grid.shape)
     share = "all" if outside == 1 else f"{outside:.0%}"
     return (

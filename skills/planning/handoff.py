@@ -262,6 +262,7 @@ def _across(a_m: Floats, present: Floats, toward: ArrayLike | None) -> Floats:
 
 
 def _toward(present: Floats, n_star: Floats, a_star: Floats, sign: int) -> Realignment:
+    """Return the realignment to one of the two rotations with this approach."""
     target = np.stack([n_star, np.cross(a_star, n_star), a_star], axis=1)
     angle, axis = _turn_between(present, target)
     return Realignment(target, angle, n_star if angle == 0 else axis, sign)
@@ -278,5 +279,6 @@ def _turn_between(start: Floats, target: Floats) -> tuple[float, Floats]:
 
 
 def _unit(vector: Floats) -> Floats | None:
+    """Return a vector with length 1; None if it has none."""
     length = float(np.linalg.norm(vector, axis=-1))
     return vector / length if length > 1e-12 else None

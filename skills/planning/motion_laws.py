@@ -301,6 +301,7 @@ def _ticks_of_moves(start: Pose, end: Pose, pace: Pace) -> int:
 
 
 def _between(start: Pose, end: Pose, done: Floats) -> Poses:
+    """Return poses on the way from one to another, at parts of it that are done, (T,)."""
     tip = start.tip_mm + done[:, None] * (end.tip_mm - start.tip_mm)
     rotation = turn(start.rotation, end.rotation, done)
     if len(done) > 1:  # without round-off, because the next part begins exactly at the end pose

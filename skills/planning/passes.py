@@ -306,6 +306,7 @@ def _arms(psm_a: Pose, psm_m: Pose | None) -> Arms:
 
 
 def _meeting(one: PassPath, number: int, psm_m: PsmM) -> Meeting:
+    """Return the poses of PSM_M around the hand-off of a pass; raises `BadPlan` for a pass without A2."""
     if one.target_rotation is None:
         raise BadPlan(f"Pass {number} has no A2, so PSM_M cannot take the needle.", **{"pass": number})
     return meeting(Pose(one.tip_mm[-1], one.target_rotation), psm_m, one.taking)

@@ -384,6 +384,7 @@ class Hand:
         return self._between(self.tip_mm, count), turned, opened
 
     def _between(self, values: Floats, count: int) -> Floats:
+        """Return values, (M, ...), at evenly spaced times, (count, ...)."""
         from scipy.interpolate import CubicSpline  # here, because clients read plans without it
 
         # A cubic spline, because a step of the speed at every sample would be an acceleration without bound.

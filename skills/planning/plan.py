@@ -378,6 +378,12 @@ def _pass(
     jaw: Floats,
     plan: SuturePlan,
 ) -> Pass:
+    """Plan one pass at a suture point.
+
+    Raises:
+        BadPlan: From its start the goal is not reached.
+        OutsideGrid: Its start is too far outside of its grid world.
+    """
     grid = policy.path.grid
     goal = grid.centres_mm(policy.path.goal) if recorded is None else recorded.trace.ends_mm[1]
     turned = kinematics.matrix_of(np.array([point.rotation_xyzw]))[0]
@@ -551,6 +557,7 @@ def _at_its_own_place(policy: Policy, demo: Demo) -> SuturePlan:
     """Plan one pass at the demonstrated place, along the fitted path if one can be fitted."""
 
     def pass_along(recorded: Demo | None) -> SuturePlan:
+        """Return the plan of one pass, fitted to a recording or through the centres of the cells."""
         goal_mm = policy.path.tip_mm[-1] if recorded is None else ends_of(recorded, policy.path)[1]
         x, y, z = goal_mm.tolist()
         return stack(

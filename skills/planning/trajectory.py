@@ -295,6 +295,7 @@ def _peak_mm_s(routes: Sequence[Route]) -> float:
 
 
 def _taking(passes: Sequence[PassPath]) -> motion_laws.Poses | None:
+    """Return the recorded poses of PSM_M at the hand-offs; None if a pass has none."""
     recorded = [one.taking for one in passes if one.taking is not None]
     if len(recorded) < len(passes):
         return None

@@ -229,6 +229,7 @@ def _measured(side: list[tuple[Motion, Signal]]) -> tuple[Floats, Floats]:
 
 
 def _arm(motion: Motion, jaw: Signal, start_ns: int, end_ns: int) -> _Arm:
+    """Return one arm between two stamps, on the grid."""
     inside = (motion.stamps_ns >= start_ns) & (motion.stamps_ns <= end_ns)
     assert motion.rotation_xyzw is not None
     seconds = (motion.stamps_ns[inside] - start_ns) / 1e9

@@ -357,6 +357,7 @@ def png(figure: "Figure") -> bytes:
 
 
 def _kind(pair: LinkPair) -> str:
+    """Return the label of the line in which a pair's distance is plotted."""
     if pair.other == PAD:
         return f"{pair.body} to the pad"
     return FINGERS_OF_BOTH if pair.may_touch else OTHERS

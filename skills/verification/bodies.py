@@ -141,6 +141,7 @@ def radii_of(instrument: str) -> Floats:
 
 
 def _of(instrument: str) -> tuple[ArmCapsule, ...]:
+    """Return the outer bodies of the arm that an instrument is on."""
     return BODIES[instrument_of(instrument).arm.name]
 
 
@@ -391,6 +392,7 @@ def _named(trajectory: Trajectory, sample: int, part: int, other: int, least_mm:
 
 
 def _all_nearest(trajectory: Trajectory, looks: Ints, seen: Floats) -> tuple[NearestBodies, ...]:
+    """Return the least distance of each pair of parts that came within `CLEARANCE_SEEN_MM`, the least first."""
     known = np.nan_to_num(seen, nan=-np.inf, posinf=np.inf, neginf=-np.inf)
     least, at = known.min(axis=0), known.argmin(axis=0)
     pairs = [(int(i), int(j)) for i, j in np.argwhere(least < CLEARANCE_SEEN_MM)]

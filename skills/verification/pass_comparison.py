@@ -139,6 +139,7 @@ class PassComparison:
     # ---- A1 --------------------------------------------------------------------------------------------------------
 
     def _speeds(self) -> None:
+        """Compare the speeds of both tips with the greatest that was asked."""
         for arm in (self.arm, self.other):
             if arm is not None and self.request.demo is not None:
                 speed = np.linalg.norm(np.diff(arm.tip_mm[self.rows], axis=0), axis=1) * self.rate_hz
@@ -231,6 +232,7 @@ class PassComparison:
     # ---- A2 and PSM_M ----------------------------------------------------------------------------------------------
 
     def _a2(self) -> None:
+        """Compare A2: the tip held, the jaw's turn and its end, and PSM_M."""
         request, a2, end = self.request, self.a2, self.stood
         assert request.psm_m is not None
         self.put("tip leaves the hand-off", a2, _far_mm(self.arm.tip_mm[a2], self.place_mm))
@@ -262,6 +264,7 @@ class PassComparison:
         return np.array([max(stands_from(self.motion, int(self.a2[-1])), int(self.a2[0]))])
 
     def _papers_a2(self, turned: Floats) -> None:
+        """Compare the jaw, (3, 3), with the paper's hand-off."""
         end, n = self.stood, turned[:, 0]
         hinge = np.linalg.norm(np.cross(n, self.request.approach)), abs(n @ self.request.approach)
         self.put("A2's hinge off PSM_M's approach", end, np.degrees(np.arctan2(*hinge)))
@@ -281,6 +284,7 @@ class PassComparison:
         return quarter - TAKEN_MM * request.approach, jaws
 
     def _psm_m(self) -> None:
+        """Compare where PSM_M waits, how it comes and goes, and where it takes the needle."""
         other, a1, a2, end = self.other, self.a1, self.a2, self.stood
         assert other is not None and self.request.psm_m is not None
         taken_mm, jaws = self.taking()
@@ -357,6 +361,7 @@ class PassComparison:
     # ---- transfers -------------------------------------------------------------------------------------------------
 
     def _transfer(self) -> None:
+        """Compare the start of the pass and the transfer to where A1 begins."""
         rows = self.transfer
         first = self.rows[:1]
         if self.before is None:

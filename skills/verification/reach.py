@@ -190,6 +190,7 @@ class _Moved:
     # ---- distances -------------------------------------------------------------------------------------------------
 
     def _portions(self, rows: Ints) -> list[Ints]:
+        """Divide positions into parts that are computed at once."""
         most = max(1, AT_ONCE // len(self.poses.phase))
         return [rows[k : k + most] for k in range(0, len(rows), most)]
 
@@ -236,6 +237,7 @@ class _Moved:
         )
 
     def _checks(self, motion: Trajectory, looks: "_Looks") -> Iterator[_Check]:
+        """Yield the checks of distances at some positions and poses."""
         scene, arms = self.plan.scene, motion.arms
         if len(arms) == 2:
             ways = [moved_mm(arm.joints, np.roll(arm.joints, -1, axis=0), arm.instrument) for arm in arms]

@@ -201,6 +201,7 @@ def groups_of(trajectory: Trajectory) -> list[tuple[PlannedArm, Group]]:
 
 
 def _tool(arm: PlannedArm) -> Group:
+    """Return the capsules of an arm's tool."""
     steps = clearance.travel_mm(arm.joints, arm.instrument)
     if arm.name == PSM_A:
         steps[:, clearance.FINGERS] += clearance.FINGER_REACH_MM * np.abs(np.diff(clearance.openings(arm)))[:, None]
@@ -208,10 +209,12 @@ def _tool(arm: PlannedArm) -> Group:
 
 
 def _bodies(arm: PlannedArm) -> Group:
+    """Return the capsules of an arm's outer bodies, without its shaft and hand."""
     names = names_of(arm.instrument)[: -len(TOOL)]
     way = way_mm(moved_mm(arm.joints[:-1], arm.joints[1:], arm.instrument)[:, : len(names)])
 
     def axes(at: Ints) -> tuple[clearance.Links, ...]:
+        """Return the axes of the bodies at some samples."""
         parts = placed(arm, arm.joints[at])
         return (clearance.Links(parts.begin_mm[:, : len(names)], parts.end_mm[:, : len(names)]),)
 

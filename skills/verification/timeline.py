@@ -170,12 +170,14 @@ class _Clock:
 
     @classmethod
     def of(cls, start_s: float, end_s: float, rate_hz: float) -> "_Clock":
+        """Return the rows from one time to another, at a rate or a lower one that `RATE_HZ` and `MOST_ROWS` allow."""
         rate_hz = min(rate_hz, RATE_HZ, (MOST_ROWS - 1) / max(end_s - start_s, 1e-9))
         rows = 1 + int((end_s - start_s) * rate_hz + 1e-6)
         return cls(start_s + np.arange(rows) / rate_hz, rate_hz)
 
     @property
     def every(self) -> int:
+        """Rows between two rows of bodies."""
         return max(1, int(self.rate_hz / BODIES_HZ))
 
     def column(self, stamps_s: Floats, values: ArrayLike) -> Floats:
@@ -266,6 +268,7 @@ class _Clock:
 
 
 def _column(values: Floats) -> Any:
+    """Return values as a read-only column of 32-bit floats."""
     column = np.array(values, np.float32)
     column.setflags(write=False)
     return column
@@ -363,6 +366,7 @@ def _session(recording: Recording, start_s: float, end_s: float) -> dict[str, An
     down = [(first, last_ns if last is None else last) for first, last in presses]
 
     def within(spans_ns: Sequence[tuple[int, int]]) -> list[tuple[float, float] | None]:
+        """Return intervals in s since the recording's origin; None for those outside of the part."""
         spans = recording.seconds(np.array(spans_ns, np.int64).reshape(-1, 2)).tolist()
         return [(first, last) if last > start_s and first < end_s else None for first, last in spans]
 

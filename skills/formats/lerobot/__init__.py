@@ -242,6 +242,11 @@ def read_dataset(files: Files, root: str) -> Dataset:
 
 
 def _feature(name: str, described: Any) -> Feature:
+    """Return a feature from its description in info.json.
+
+    Raises:
+        UnreadableRecording: It has no type, no plausible shape, or not as many names as numbers.
+    """
     try:
         dtype, shape, names = str(described["dtype"]), described["shape"], described.get("names")
         if dtype in ("image", "video"):
@@ -283,6 +288,7 @@ def _tasks_in(file: BinaryIO) -> dict[int, str]:
 
 
 def _object(files: Files, name: str) -> Json:
+    """Return a file that is a JSON object; any other raises `UnreadableRecording`."""
     parsed = _parsed(files.text(name), name)
     if not isinstance(parsed, dict):
         raise UnreadableRecording(f"{shown(name)} of the dataset is not a JSON object.")
@@ -290,6 +296,7 @@ def _object(files: Files, name: str) -> Json:
 
 
 def _parsed(text: str, name: str) -> Any:
+    """Return JSON of limited length; any other text raises `UnreadableRecording`."""
     if len(text) > JSON_CHARACTERS:
         raise UnreadableRecording(f"{shown(name)} of the dataset has more than {JSON_CHARACTERS} characters.")
     try:

@@ -270,6 +270,7 @@ def _json(value: object) -> bytes:
 
 
 def _listed(episodes: Mapping[int, Episode]) -> str:
+    """Return the numbers of the episodes in words."""
     numbers = list(episodes)
     whole = numbers == list(range(numbers[0], numbers[-1] + 1))
     return f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers[:50]))

@@ -206,6 +206,7 @@ def several_episodes(episodes: int) -> UnreadableRecording:
 
 
 def _check_one_episode(dataset: Dataset, table: ParquetTable) -> None:
+    """Refuse data of no frames, of several episodes, or of another length than the metadata claim."""
     if not table.rows:
         raise UnreadableRecording("The episode has no frames.")
     numbers = table.column("episode_index")
@@ -516,6 +517,7 @@ def _check_rate(dataset: Dataset, table: ParquetTable, stamps_ns: Ints, clock: s
 
 
 def _in_ns(seconds: Floats) -> Ints:
+    """Convert seconds to whole nanoseconds, shape (T,)."""
     if not (np.abs(seconds) < 9e9).all():
         raise UnreadableRecording("A timestamp is after the year 2255; give seconds.")
     whole = np.floor(seconds)  # apart, so that the fraction keeps its digits

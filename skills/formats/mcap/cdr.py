@@ -109,6 +109,7 @@ def _short(name: str) -> str:
 
 
 def _add_fields(fields: list[Field], parts: dict[str, list[str]], name: str, *, prefix: str, depth: int) -> None:
+    """Append the fields of a message type, and of those nested in it; raises as `fields_of`."""
     if name not in parts or depth > DEPTH_LIMIT:
         raise UnreadableRecording(f"{name} is not defined in the file, or contains itself.")
     declared = [match for match in map(_FIELD.match, parts[name]) if match is None or not match[4]]
