@@ -108,9 +108,9 @@ def read_metadata(text: str) -> Metadata:
         files = tuple(PurePosixPath(name).name for name in bag["relative_file_paths"])
         for topic in bag["topics_with_message_count"]:
             name, messages = topic["topic_metadata"]["name"], topic["message_count"]
-            if not (name and messages.isdecimal()):
+            if not (name and messages.isdecimal() and len(messages) <= 18):  # as many digits as 64 bits hold
                 raise ValueError(messages)
-            counts[name] += int(messages[:18])  # as many digits as 64 bits hold
+            counts[name] += int(messages)
         if not files:
             raise ValueError("no files")
         mode = bag.get("compression_mode", "")

@@ -84,6 +84,8 @@ def _samples(text: TextIO, parts: tuple[str, str]) -> tuple[Ints, Floats, list[s
             sec, nanosec, frame, *pose = (row[column] for column in columns)
             stamps.append(int(sec) * 1_000_000_000 + int(nanosec))
             numbers.extend(map(float, pose))
+            if "_" in "".join((sec, nanosec, *pose)) or not 0 <= int(nanosec) < 1_000_000_000:
+                raise ValueError(nanosec)  # Python parses 1_000, which no exporter writes
         except (ValueError, IndexError, OverflowError):
             line = rows.line_num + _HEADER_LINE - 1
             raise UnreadableRecording(
