@@ -23,6 +23,7 @@ from rich.table import Table
 
 from skills.client import Client, JobFailed, Problem
 from skills.samples import load_samples
+from skills.schemas.operation import Job
 from skills.schemas.playbacks import Playback
 from skills.schemas.policies import Policy
 from skills.settings import settings
@@ -60,8 +61,8 @@ def main() -> int:
         out.print("\nLearnt, certified, released; stacked at five suture points; played back in PyBullet:")
         out.print(report)
         out.print(
-            "The worlds are those of an uncalibrated arm, because no errors of the arms were stated; nothing would be "
-            "exported. docs/errors.md says how to measure and state yours.",
+            "The worlds are those of calibrated arms; an arm as it is delivered, which is assumed unless errors are "
+            "stated, hands over in none. docs/errors.md says how to measure and state yours.",
             soft_wrap=True,
         )
         draw_samples(client, styles)
@@ -140,7 +141,7 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
     followed = client.rollout(surgeon, suture, policy.start_mm)
     plan = client.plan(surgeon, suture, suture_points(policy), psm_m=SAMPLE_PSM_M, tissue_mm=SAMPLE_TISSUE_MM)
     laps.append(time.monotonic())
-    playback = played(client, plan.id)
+    playback = played(client, client.play(plan.id, "calibrated"))  # an arm as it is delivered hands nothing over
     laps.append(time.monotonic())
     (PICTURES / f"{surgeon}-{suture}-playback.png").write_bytes(client.picture(playback.id))
     coverage, total = policy.coverage, followed.dtw_total_mm
@@ -156,9 +157,9 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
     return followed.finished and total == 0 and reach_all and playback.feasible, playback.id
 
 
-def played(client: Client, plan: str) -> Playback:
-    """Play a plan in the simulator, and return the playback."""
-    done = client.wait(client.play(plan))
+def played(client: Client, job: Job) -> Playback:
+    """Wait for a playback in the simulator, and return it."""
+    done = client.wait(job)
     assert done.result is not None, done
     return client.playback(done.result["playback"])
 
@@ -238,7 +239,7 @@ def real_recording(client: Client) -> None:
     except Problem as refused:
         out.print(f"Not played back: {refused}", soft_wrap=True)
         return
-    playback = played(client, plan.id)
+    playback = played(client, client.play(plan.id))
     (PICTURES / "real-recording-playback.png").write_bytes(client.picture(playback.id))
     assert playback.headline is not None, playback
     out.print(f"Played back at its own place: {playback.headline.text}", soft_wrap=True)

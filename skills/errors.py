@@ -24,9 +24,10 @@
     ├── TooSlow                 the body of a request did not arrive in time
     ├── Corrupt                 stored data no longer matches its digest
     ├── Busy                    the database or the queue cannot be used now
+    │   ├── DatabaseBusy        the database: locked, overloaded or away; a job waits for it
+    │   │   └── DatabaseUnusable    and why, of which it is a NotReady too: logged, and never sent over HTTP
     │   ├── StorageFull         a disk is full: of the database, or of temporary files
     │   └── NotReady            a part of the installation cannot be used; the message says which
-    │       └── DatabaseUnusable    its database, and why: logged, and never sent over HTTP
     ├── SimulationFailed        the simulator crashed, hung or returned nonsense
     ├── LearningFailed          the learning process crashed, hung or exceeded its limits
     └── Unanswered              a subprocess returned no result; its caller raises an error in words of its own
@@ -37,7 +38,8 @@ line and Python each word in their own terms (`skills.remedies`). Only `skills.a
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from math import isfinite
 from typing import TypeVar
 
 from skills.remedies import Door, Remedy
@@ -84,6 +86,24 @@ E = TypeVar("E", bound=SkillsError)
 
 class BadInput(SkillsError):
     """The input is wrong; nothing was stored."""
+
+
+def refuse_not_finite(value: object, name: Callable[[Sequence[str]], str] = ".".join, path: Sequence[str] = ()) -> None:
+    """Refuse nan and inf, which JSON does not have, in the values of mappings and sequences.
+
+    Args:
+        value: A number, or a mapping or sequence with others in it; anything else passes.
+        name: Names a value in the message by its path.
+        path: The keys and indices that lead to the value.
+
+    Raises:
+        BadInput: There is one; the message names it.
+    """
+    if isinstance(value, float) and not isfinite(value):
+        raise BadInput(f"{name(path)} is {value}; every number must be finite.")
+    named = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list | tuple) else ()
+    for key, part in named:
+        refuse_not_finite(part, name, (*path, str(key)))
 
 
 class AmbiguousDigest(BadInput):
@@ -150,6 +170,13 @@ class Busy(SkillsError):
     """The database or the queue cannot be used now."""
 
 
+class DatabaseBusy(Busy):
+    """The database is locked, overloaded or away: a job waits for it, at no cost of its attempts."""
+
+
+DatabaseBusy.kind = Busy.kind  # over HTTP there is no difference
+
+
 class StorageFull(Busy):
     """A disk is full, of the database or of temporary files: a retry does not help, free space does."""
 
@@ -158,7 +185,7 @@ class NotReady(Busy):
     """A part of the installation cannot be used: its database, its queue, its workers."""
 
 
-class DatabaseUnusable(NotReady):
+class DatabaseUnusable(NotReady, DatabaseBusy):
     """The database cannot be used; the message names its file or server, so it is logged and never sent over HTTP."""
 
 

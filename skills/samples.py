@@ -31,22 +31,42 @@ from skills.schemas.recordings import Recording
 from skills.seeds.recordings import sample_recordings
 
 
-def load_samples(client: Client) -> Iterator[Demonstration]:
-    """Store the synthetic surgeons and every hand-off that the service proposes in their recordings."""
+@contextmanager
+def going_on(errors: list[str] | None, at: str) -> Iterator[None]:
+    """Add an error of the block to a list, and go on after the block; without a list it is raised."""
+    try:
+        yield
+    except SkillsError as error:
+        if errors is None:
+            raise
+        errors.append(f"{at}: {error}")
+
+
+def load_samples(client: Client, errors: list[str] | None = None) -> Iterator[Demonstration]:
+    """Store the synthetic surgeons and every hand-off that the service proposes in their recordings.
+
+    Args:
+        client: The service.
+        errors: Gets the errors, and the other samples are stored all the same; without it the first error is raised.
+    """
     text = (resources.files("skills") / "seeds" / "surgeons.toml").read_text()
     for surgeon in tomllib.loads(text)["surgeon"]:
-        client.put_surgeon(surgeon["slug"], skill_level=surgeon["skill_level"], handedness=surgeon["handedness"])
+        with going_on(errors, surgeon["slug"]):
+            client.put_surgeon(surgeon["slug"], skill_level=surgeon["skill_level"], handedness=surgeon["handedness"])
     for sample in sample_recordings():
-        stored = client.add_recording(sample.data)
-        for part in stored.segments:
-            yield client.cut_demo(
-                stored.sha256,
-                surgeon=sample.surgeon,
-                suture=sample.suture,
-                arm=part.arm,
-                start_s=part.start_s,
-                end_s=part.end_s,
-            )
+        style = f"{sample.surgeon}, {sample.suture}"
+        with going_on(errors, style):
+            stored = client.add_recording(sample.data)
+            for part in stored.segments:
+                with going_on(errors, style):
+                    yield client.cut_demo(
+                        stored.sha256,
+                        surgeon=sample.surgeon,
+                        suture=sample.suture,
+                        arm=part.arm,
+                        start_s=part.start_s,
+                        end_s=part.end_s,
+                    )
 
 
 def write_samples(folder: Path) -> list[tuple[Path, str]]:
@@ -143,7 +163,7 @@ def send_trials(
         try:
             # once for each surgeon, not for each trial
             if sent.surgeon not in known:
-                _make_known(client, sent.surgeon, sent.skill_level)
+                make_known(client, sent.surgeon, sent.skill_level)
                 known.add(sent.surgeon)
             with _packed(trial) as file:
                 stored = client.add_recording(file, surgeon=sent.surgeon)
@@ -155,7 +175,7 @@ def send_trials(
         yield sent
 
 
-def _make_known(client: Client, surgeon: str, skill_level: Skill | None) -> None:
+def make_known(client: Client, surgeon: str, skill_level: Skill | None = None) -> None:
     """Create a surgeon, unless the surgeon exists."""
     try:
         client.surgeon(surgeon)

@@ -43,7 +43,7 @@ from skills.jobs.warm_up import align_once, warm_up
 from skills.library.operation.erasure_list import keep_erasures, keep_up_erasures
 from skills.library.people.keys import refuse_without_keys
 from skills.remedies import Action, Remedy
-from skills.samples import load_samples
+from skills.samples import going_on, load_samples
 from skills.sandbox.forked import layers_held, refuse_uncontained
 from skills.settings import PREFIX, Settings
 
@@ -495,11 +495,10 @@ def _leave(_signal: int, _frame: FrameType | None) -> None:
 
 def _load(settings: Settings, key: str) -> None:
     """Load the samples and train them, over HTTP; print what came of it."""
-    try:
-        with Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
-            for demo in load_samples(client):
+    errors: list[str] = []
+    with going_on(errors, "the service"), Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
+        for demo in load_samples(client, errors):
+            with going_on(errors, f"{demo.surgeon}, {demo.suture}"):
                 client.train(demo.surgeon, demo.suture, release=True)
-    except SkillsError as error:
-        print(f"The samples are not loaded: {error}", flush=True)
-    else:
-        print("The samples are loaded.", flush=True)
+    few = ["Some samples are not loaded or trained:", *dict.fromkeys(errors)]
+    print("\n  ".join(few) if errors else "The samples are loaded.", flush=True)

@@ -137,6 +137,8 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Pat
     skills.refuses("policy", "show", *STYLE, says="No policy")
     skills.does("erase", "wren", "--yes")
     skills.refuses("train", *STYLE, says="erased permanently")
+    code, said = skills("seed")
+    assert (code, "plover" in said, "Some samples are not loaded. wren: " in said) == (1, True, True), said
 
 
 def test_a_command_trains_with_a_worker_process_of_its_own(with_worker) -> None:

@@ -170,11 +170,8 @@ def _why(one: ErrorDetails, body: Any = None) -> str:
         known = re.findall(r"'([^']+)'", about.get("expected") or about["expected_tags"])
         return f"must be one of {', '.join(known)}{_meant(about.get('tag', given), known)}"
     words = LIMITS.get(kind)
-    said = (
-        str(one["msg"]).removeprefix("Value error, ")
-        if words is None
-        else words.format(**{name: _short(value) for name, value in about.items()})
-    )
+    limits = {name: f"{value:g}" if isinstance(value, float) else value for name, value in about.items()}
+    said = str(one["msg"]).removeprefix("Value error, ") if words is None else words.format(**limits)
     given = _number(given)
     if given is None or not abs(given) < SHOWN:
         return said
@@ -189,10 +186,6 @@ def _number(given: object) -> float | None:
         return float(given) if isinstance(given, int | float | str) and not isinstance(given, bool) else None
     except (ValueError, OverflowError):
         return None
-
-
-def _short(limit: object) -> object:
-    return f"{limit:g}" if isinstance(limit, float) else limit
 
 
 def answer_to(error: errors.SkillsError) -> Response:

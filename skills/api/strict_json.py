@@ -41,7 +41,8 @@ def strictly_read(text: str | bytes) -> Any:
     Raises:
         JSONDecodeError: It is not JSON, an object repeats a name, or a number is not finite.
     """
-    return json.loads(text, object_pairs_hook=_once, parse_float=_number, parse_constant=_refuse)
+    # -0 is 0: equal requests have equal digests
+    return json.loads(text, object_pairs_hook=_once, parse_float=lambda x: float(x) + 0.0, parse_constant=_refuse)
 
 
 def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
@@ -49,10 +50,6 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     if len(made) < len(pairs):
         raise json.JSONDecodeError("An object has the same name twice", "", 0)
     return made
-
-
-def _number(text: str) -> float:
-    return float(text) + 0.0  # -0 is 0: equal requests have equal digests
 
 
 def _refuse(_constant: str) -> NoReturn:

@@ -21,7 +21,6 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from functools import partial, wraps
-from math import isfinite
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -43,7 +42,7 @@ from typer.models import ArgumentInfo, OptionInfo
 
 from skills.cli.completion import complete_surgeons, complete_sutures
 from skills.cli.output import Answer, err, print_json
-from skills.errors import BadInput, SkillsError
+from skills.errors import BadInput, SkillsError, refuse_not_finite
 from skills.remedies import Door, did_you_mean
 
 if TYPE_CHECKING:
@@ -125,7 +124,7 @@ def command(
                     values[keywords] = {
                         field: parse(value) for field, (parse, value) in given.items() if value not in (None, [])
                     }
-                _refuse_not_finite(values)
+                refuse_not_finite(values, lambda path: _flag(next(one for one in path if one not in flags)))
                 answer = function(**values)
                 if answer is not None:
                     _print(answer, as_json)
@@ -147,17 +146,9 @@ def command(
     return register
 
 
-def _refuse_not_finite(values: Mapping[str, Any]) -> None:
-    """Refuse nan and inf, which Python reads as numbers.
-
-    Raises:
-        BadInput: A value, or a field of keyword arguments, is or has such a number.
-    """
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            _refuse_not_finite(value)
-        elif isinstance(value, float) and not isfinite(value):
-            raise BadInput(f"--{OPTIONS.get(name, name).replace('_', '-')} {value}: every number must be finite.")
+def _flag(name: str) -> str:
+    """Return the option of a parameter."""
+    return f"--{OPTIONS.get(name, name).replace('_', '-')}"
 
 
 def _with_help(parameter: inspect.Parameter, helps: Mapping[str, str]) -> inspect.Parameter:
@@ -199,7 +190,8 @@ def _flags(keywords: Any, declared: Collection[str]) -> Iterator[tuple[inspect.P
             continue  # a value with fields of its own, for which the command has options
         option = OPTIONS.get(name, name).replace("_", "-")
         required = get_origin(kind) is Required
-        among = [one for one in get_args(kind) if one is not NoneType] if _is_union(kind) or required else [kind]
+        is_several = get_origin(kind) in (Union, UnionType, Required)
+        among = [one for one in get_args(kind) if one is not NoneType] if is_several else [kind]
         flag, parse = _flag_type(among)
         repeated = " Repeatable." if get_origin(flag) is list else ""
         switch = f"--{option}/--no-{option}" if kind == (bool | None) else f"--{option}"
@@ -211,10 +203,6 @@ def _flags(keywords: Any, declared: Collection[str]) -> Iterator[tuple[inspect.P
             annotation=Annotated[flag if required else flag | None, info],
         )
         yield parameter, parse
-
-
-def _is_union(kind: Any) -> bool:
-    return get_origin(kind) in (Union, UnionType)
 
 
 def _flag_type(among: Sequence[Any]) -> tuple[Any, Callable[[Any], Any]]:
@@ -294,10 +282,9 @@ def numbers(text: str, count: int) -> list[float]:
         found = [float(part) for part in text.split(",")]
     except ValueError:
         found = []
-    if len(found) == count and not all(map(isfinite, found)):
-        raise BadInput(f"{text!r}: every number must be finite.")
     if len(found) != count:
         raise BadInput(f"{text!r} is not {count} numbers separated by commas.", "Example: 1,2.5,-3")
+    refuse_not_finite(found, lambda _: repr(text))
     return found
 
 

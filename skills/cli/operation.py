@@ -1,6 +1,7 @@
 """Commands on the installation itself: serve, worker, migrate, seed, backup, restore, erasures, verify, doctor."""
 
 import gc
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -111,7 +112,10 @@ def seed(to: Annotated[Path | None, typer.Option("--files", file_okay=False)] = 
         written = write_samples(to)
         return table([{"file": str(file), "surgeon": surgeon} for file, surgeon in written], ("file", "surgeon"))
     with service() as client, err.status("loading"):
-        return table(list(load_samples(client)), ("surgeon", "suture", "id", "report.path_states"))
+        errors: list[str] = []
+        stored = list(load_samples(client, errors))
+    refused = SkillsError(f"Some samples are not loaded. {' '.join(dict.fromkeys(errors))}") if errors else None
+    return replace(table(stored, ("surgeon", "suture", "id", "report.path_states")), refused=refused)
 
 
 @command(commands)

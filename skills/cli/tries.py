@@ -73,10 +73,12 @@ def try_bag(
         errors: Errors of the arms: calibrated, uncalibrated, or a JSON file (docs/errors.md); asked.
         folder: Keep everything in this folder; without it a temporary one is used, and deleted.
     """
+    from skills.samples import make_known
+
     options |= {"errors": arm_errors_of(errors), "psm_m": psm_m_of(approach, base)}
     printer = _StepPrinter(context, as_json)
     with _installation(folder, printer) as settings, connect(settings, workers=1) as client:
-        _ensure_surgeon(client, surgeon)
+        make_known(client, surgeon)
         with ready_one(path, table, episode, tool) as (file, progress):
             stored = client.add_recording(file, surgeon=surgeon, progress=progress, **table)
         while True:
@@ -113,18 +115,6 @@ def _installation(folder: Path | None, printer: "_StepPrinter") -> "Iterator[Set
         own = {"database_url": f"sqlite:///{made}/database/skills.sqlite", "signing_key": Path(made) / "signing.key"}
         # the film of a database that is deleted need not be finished, so its worker does not warn about it
         yield here.model_copy(update={**own, "log_level": "error"})
-
-
-def _ensure_surgeon(client: "Client", surgeon: str) -> None:
-    """Add a surgeon that there is not; one that there is stays as it is."""
-    from skills.client import Problem
-
-    try:
-        client.surgeon(surgeon)
-    except Problem as problem:
-        if problem.status != 404:
-            raise
-        client.put_surgeon(surgeon)
 
 
 def _tried(client: "Client", printer: "_StepPrinter", job: "Job") -> "Job":

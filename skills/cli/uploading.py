@@ -47,7 +47,7 @@ def ready(path: Path) -> Iterator[tuple[Path, "Progress"]]:
 
     bag = find_bag(path)
     for name in bag.left_aside:
-        typer.echo(f"{name} is neither JSON nor a recorder's: left aside.", err=True)
+        typer.echo(f"{name} has no tags of a recorder: left aside.", err=True)
     read = 0
     with bar("reading") as reading:
 

@@ -13,8 +13,9 @@ A transaction that names things may only rely on what is under these names (`ski
 be short, because one that locks everything waits for it, and later ones wait for that.
 
 Nothing is retried here except connecting, before any statement was sent. A caller that loses the database during a
-transaction gets `Busy`, and does not know whether its changes were committed. It may repeat the request: uploads, jobs
-and releases are identified by their content, so a repeated one is found or stored, and never stored twice.
+transaction gets `DatabaseBusy`, and does not know whether its changes were committed. It may repeat the request:
+uploads, jobs and releases are identified by their content, so a repeated one is found or stored, and never stored
+twice.
 """
 
 import logging
@@ -38,7 +39,7 @@ from skills.db.leaves import CHECKPOINTS
 from skills.db.revisions import refuse_unknown, revision_of, revisions, upgrade
 from skills.db.row_visibility import ONLY, Only
 from skills.db.tiles import fill_tiles
-from skills.errors import Busy, Conflict, Corrupt, DatabaseUnusable, SkillsError, StorageFull
+from skills.errors import Conflict, Corrupt, DatabaseBusy, DatabaseUnusable, SkillsError, StorageFull
 from skills.remedies import Action, Remedy
 from skills.settings import Settings, settings
 
@@ -165,7 +166,7 @@ class Database:
         Raises:
             NotReady: They would be changed, and it is not the database that was signed last.
             Conflict: The database was made by a newer version of the code, or by another commit before a release.
-            Busy: It cannot be reached or written.
+            DatabaseBusy: It cannot be reached or written.
             BadSettings: The signing key of its history is missing, or cannot be made.
         """
         with translating_errors(self.engine.url), self.engine.execution_options(writes=True).connect() as connection:
@@ -218,7 +219,7 @@ def translating_errors(url: URL) -> Iterator[None]:
     try:
         yield
     except TimeoutError as error:
-        raise Busy("The database is overloaded; try again in a moment.") from error
+        raise DatabaseBusy("The database is overloaded; try again in a moment.") from error
     except OperationalError as error:
         if is_full(error):
             log.error("The database's disk is full: %s", str(error.orig).strip())
@@ -227,7 +228,7 @@ def translating_errors(url: URL) -> Iterator[None]:
             ) from error
         if getattr(error.orig, "sqlstate", None) == POSTGRESQL_FAILED:
             log.critical("The disk of the PostgreSQL server failed: %s", str(error.orig).strip())
-            raise Busy(
+            raise DatabaseBusy(
                 "The disk of the database failed, so it is unknown whether this was stored.",
                 "Ask the operator of the service to check the disk and its log, then look before you try again.",
             ) from error
@@ -238,7 +239,7 @@ def translating_errors(url: URL) -> Iterator[None]:
         if getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_ERROR:
             raise  # a wrong statement, which would fail again: a bug
         log.warning("The database could not be used: %s", str(error.orig).strip())
-        raise Busy("The database cannot be used now; try again in a moment.") from error
+        raise DatabaseBusy("The database cannot be used now; try again in a moment.") from error
     except DatabaseError as error:
         if (unusable := _unusable(url, error)) is not None:
             raise unusable from error

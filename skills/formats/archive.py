@@ -106,7 +106,7 @@ class Archive:
             UnreadableRecording: Damaged, longer than `TEXT_BYTES`, or not UTF-8.
         """
         if self._infos[name].file_size > TEXT_BYTES:
-            raise UnreadableRecording(f"{shown(name)} in the archive is over {TEXT_BYTES} bytes; remove it.")
+            raise UnreadableRecording(f"{shown(name)} in the archive is over {TEXT_BYTES} bytes; leave it out.")
         with io.BytesIO() as out:
             self._copy(name, out)
             try:

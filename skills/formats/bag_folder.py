@@ -101,7 +101,7 @@ def read_metadata(text: str) -> Metadata:
         UnreadableRecording: It is not that of a bag.
     """
     if len(text) > METADATA_CHARACTERS:
-        raise UnreadableRecording(f"{METADATA} has more than {METADATA_CHARACTERS} characters. Remove it.")
+        raise UnreadableRecording(f"{METADATA} has more than {METADATA_CHARACTERS} characters. Move it away.")
     counts: Counter[str] = Counter()
     try:
         bag = _plain_yaml(text)["rosbag2_bagfile_information"]
@@ -116,7 +116,7 @@ def read_metadata(text: str) -> Metadata:
         mode = bag.get("compression_mode", "")
     except (yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError) as error:
         raise UnreadableRecording(
-            f"{METADATA} is not the metadata of a bag. Remove it, or write it with `ros2 bag reindex`."
+            f"{METADATA} is not the metadata of a bag. Move it away, or write it with `ros2 bag reindex`."
         ) from error
     if str(mode).upper() == "MESSAGE":
         raise UnreadableRecording(f"The messages of the bag are compressed one by one (compression_mode). {UNPACK}")
@@ -157,7 +157,7 @@ def in_order(files: Sequence[str], metadata: Metadata | None) -> list[str]:
         what = (
             f"{shown(missing[0])}, which is missing" if missing else f"no file {shown(unknown[0])}, which is in the bag"
         )
-        raise UnreadableRecording(f"{METADATA} names {what}. Send the complete bag, or remove {METADATA}.")
+        raise UnreadableRecording(f"{METADATA} names {what}. Send the complete bag, or move {METADATA} away.")
     return [by_name[name] for name in metadata.files]
 
 

@@ -9,7 +9,8 @@ Two recorders write tags: jhu-dvrk/data_collection and jhu-dvrk/dvrk_data. Both 
 
 A sidecar is JSON too, with `timestamps_ns` or `frames` of `{"cpu_ts": ns}`; it belongs to the tags with the same
 `video_file`, or to those named like it with `_tags` appended. Stages without an end, and frames without a sidecar, have
-no time and are skipped; other JSON files are ignored, and those that are damaged or have comments are named.
+no time and are skipped; other JSON files are ignored, and those that are damaged, have comments or stages of another
+kind are named.
 """
 
 import json
@@ -24,7 +25,7 @@ from skills.formats.archive import printable
 TAGS_BYTES = 32 << 20  # per JSON file: the frames of a day of video
 LABELS = 10_000
 
-_WORDS = ("stages", "timestamps_ns", "frames", "video_file", "cpu_ts")  # of tags and sidecars
+_WORDS = ("timestamps_ns", "cpu_ts")  # of tags and sidecars alone; other JSON has frames and stages too
 _NAME_LENGTH = 200
 _LATEST_FRAME = 10**12  # larger numbers are nanoseconds; this one is 17 minutes after midnight of 1 January 1970
 _LATEST_NS = 2**62  # in the year 2116; later stamps are taken for errors
@@ -46,8 +47,10 @@ def read_labels(texts: Mapping[str, str]) -> tuple[tuple[Label, ...], dict[str, 
     left_aside, documents = dict[str, str](), dict[str, Json]()
     for name, text in texts.items():
         document = _parsed(name, text)
-        if document is None:
-            left_aside[_short(name)] = "left aside: it is neither valid JSON nor the tags of a recorder"
+        stages = document.get("stages", []) if isinstance(document, dict) else []
+        is_tags = name.endswith("tags.json") or (isinstance(stages, list) and all(map(_is_named, stages)))
+        if document is None or not is_tags:
+            left_aside[_short(name)] = "left aside: it has no tags of a recorder"
         elif isinstance(document, dict):
             documents[name] = document
     frames = dict(_sidecars(documents))
@@ -77,7 +80,7 @@ def _parsed(name: str, text: str) -> Any:
     except (ValueError, RecursionError) as error:
         if not name.endswith("tags.json") and not any(f'"{word}"' in text for word in _WORDS):
             return None
-        raise UnreadableRecording(f"{_short(name)} is not valid JSON ({type(error).__name__}); remove it.") from error
+        raise UnreadableRecording(f"{_short(name)} is not valid JSON ({type(error).__name__}); mend it.") from error
 
 
 def _sidecars(documents: Mapping[str, Json]) -> Iterator[tuple[str, list[Any]]]:
@@ -100,9 +103,14 @@ def _stamps_for(name: str, document: Json, frames: Mapping[str, list[Any]]) -> l
     return frames.get(str(document.get("video_file"))) or frames.get(video) or []
 
 
+def _is_named(stage: Any) -> bool:
+    """Return whether a stage has a name that is a text."""
+    return isinstance(stage, dict) and isinstance(stage.get("name"), str)
+
+
 def _label(name: str, stage: Any, stamps: list[Any]) -> Label | None:
     """Return a stage as a label; None where its start or its end has no time."""
-    if not isinstance(stage, dict) or not isinstance(stage.get("name"), str):
+    if not _is_named(stage):
         raise UnreadableRecording(f"{_short(name)} has a stage without a name.")
     start, end = (_moment_ns(stage.get(edge), stamps) for edge in ("start", "end"))
     if start is None or end is None:

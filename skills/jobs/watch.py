@@ -60,7 +60,7 @@ class Leases:
         passed_s = 0.0 if self._looked_s is None else min(now_s - self._looked_s, LONGEST_LOOK_S)
         self._looked_s = now_s
         self._silent_s = {
-            executor: self._silent_s[executor] + passed_s if self._unchanged(executor, beat) else 0.0
+            executor: self._silent_s[executor] + passed_s if self._seen.get(executor, self) == beat else 0.0
             for executor, beat in beats.items()
         }
         self._seen = dict(beats)
@@ -69,9 +69,6 @@ class Leases:
     def dead(self) -> set[str]:
         """Return the executors whose lease has expired."""
         return {executor for executor, silent_s in self._silent_s.items() if silent_s > self.lease_s}
-
-    def _unchanged(self, executor: str, beat: object) -> bool:
-        return executor in self._seen and self._seen[executor] == beat
 
 
 AT_ONCE = 100  # jobs compared in a round: a round must stay much shorter than a lease
@@ -92,6 +89,7 @@ ENDINGS = {
 # `workflows.perform_job` raises nothing itself. If a workflow ends with an error, or without an outcome in our row, the
 # engine's database or ours was unavailable. The job did not fail, so a new attempt is started.
 ENGINE_FAILED = ("ERROR", "SUCCESS")
+DATABASE_FAILED = ("OperationalError", "TimeoutError")  # SQLAlchemy's errors, by which the engine ends a workflow
 
 
 @dataclass
@@ -172,6 +170,11 @@ class Watch:
         with self.database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == self.executor))
 
+    def hand_back(self) -> None:
+        """Start a new attempt at each job that this worker holds: the jobs are not what ends it."""
+        for workflow in self._pending(self.executor):
+            self._start_over(workflow.workflow_id)
+
     def at_work(self, *queues: str) -> bool:
         """Return whether this worker still holds workflows of some queues, by default of any."""
         return bool(self._pending(self.executor, queues or QUEUES))
@@ -194,7 +197,9 @@ class Watch:
             self._inherit(dead)
         for executor in others.keys() - holders:
             if silent_s[executor] > FORGOTTEN_AFTER_LEASES * self.leases.lease_s:
-                self._forget(executor, beats[executor])
+                with self.database.writing(()) as session:
+                    silent = delete(Executor).where(Executor.id == executor, Executor.beat_at == beats[executor])
+                    session.execute(silent)
 
     def _forget_ended(self) -> None:
         """Delete some of the engine's rows of workflows that ended long ago; the outcomes are in our rows."""
@@ -229,10 +234,6 @@ class Watch:
             log.warning("Taking over from %s, silent for longer than its lease.", ", ".join(sorted(ours)))
             self.recover(sorted(ours))
 
-    def _forget(self, executor: str, beat_at: object) -> None:
-        with self.database.writing(()) as session:
-            session.execute(delete(Executor).where(Executor.id == executor, Executor.beat_at == beat_at))
-
     def _live(self) -> Sequence[Any]:
         """Return jobs that have not ended: those never enqueued first, then the oldest.
 
@@ -264,14 +265,17 @@ class Watch:
         cancel(self.client, row, attempt)
 
     def _begin_again(self, row: int, attempt: int) -> None:
-        """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`."""
-        if attempt < ENGINE_ATTEMPTS:
+        """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`.
+
+        Those at which its database was busy or away are not counted.
+        """
+        ended = self.client.list_workflows(workflow_id_prefix=f"{row}-", status=[*ENGINE_FAILED], load_input=False)
+        failed = sum(getattr(one.error, "name", None) not in DATABASE_FAILED for one in ended)
+        if failed < ENGINE_ATTEMPTS:
             log.warning("The job engine failed in job %d at attempt %d; it is started again.", row, attempt)
             self._start_over(workflow_id(row, attempt))
         else:
-            reason = (
-                f"The job engine failed {attempt} times in this job; check the worker's log, then request it again."
-            )
+            reason = f"The job engine failed {failed} times in this job; check the worker's log, then request it again."
             fail(self.database, row, attempt, reason)
 
     def _note_submitted(self, rows: Sequence[int]) -> None:

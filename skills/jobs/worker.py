@@ -138,7 +138,10 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
             gc.freeze()  # everything imported so far stays, so later collections skip it
             gc.enable()  # the callers disable it while they import
             _go_round(watch, lambda: stop.wait(ROUND_S) or parent not in (None, os.getppid()))
-        _go_if_cut_short(watch)
+        if _at_work(watch):  # a job's thread cannot be stopped, and a normal exit would wait for it
+            log.warning("Stopped during a job; another worker, or this one after its next start, will run it again.")
+            logging.shutdown()
+            os._exit(0)
         _survive(watch.leave)
     finally:
         client.destroy()
@@ -162,6 +165,7 @@ def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
             log.error(
                 "The database was unavailable for long, and the engine's retry pauses have grown; this worker restarts."
             )
+            _survive(watch.hand_back)
             logging.shutdown()
             os._exit(1)
         if over():
@@ -209,14 +213,6 @@ def _survive(step: Callable[[], None]) -> bool:
     except Exception:
         log.warning("The watch missed a round; the next one does its work.", exc_info=True)
         return False
-
-
-def _go_if_cut_short(watch: Watch) -> None:
-    """Exit the process if a job is still running: its thread cannot be stopped, and a normal exit would wait for it."""
-    if _at_work(watch):
-        log.warning("Stopped during a job; another worker, or this one after its next start, will run it again.")
-        logging.shutdown()
-        os._exit(0)
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from threading import Thread
 
 from dbos import DBOS
@@ -18,13 +19,13 @@ from sqlalchemy import func, update
 from skills.db import now
 from skills.db.service_tables import LONGEST_REASON, Job
 from skills.db.session import Database
-from skills.errors import Busy, SkillsError
+from skills.errors import Busy, DatabaseBusy, SkillsError
 from skills.jobs import POLLING_S, QUEUES, WORKFLOW, configuration, workflow_id
 from skills.library.operation import locks
 from skills.library.operation.jobs import ACTIVE, PART, end_part, names_of
 from skills.settings import Settings
 
-FIRST_PAUSE_S = 0.2
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
 BEAT_S = 0.5  # between two heartbeats while the engine is drained
 log = logging.getLogger(__name__)
 Perform = Callable[[Database, int, int, Settings], None]
@@ -43,15 +44,20 @@ class Work:
         """Try to perform a job and return whether it is settled, by success or by a permanent failure.
 
         There is a pause before each retry; it starts at `FIRST_PAUSE_S` and is multiplied by four each time. It is not
-        the engine's durable sleep, which would count a step of the wall clock as time that has passed.
+        the engine's durable sleep, which would count a step of the wall clock as time that has passed. A busy database
+        is waited for, and takes no try.
         """
         time.sleep(FIRST_PAUSE_S * 4 ** (tries - 1) if tries else 0.0)
-        try:
+
+        def perform() -> None:
             if start(self.database, row, attempt):
                 self.perform(self.database, row, attempt, self.settings)
+
+        try:
+            self._when_not_busy(row, perform)
             return True
-        except Busy:  # temporary, so it is retried; other errors of ours would fail again
-            log.warning("Job %d: the database was busy at attempt %d.", row, tries + 1)
+        except Busy as busy:  # temporary, so it is retried; other errors of ours would fail again
+            log.warning("Job %d, attempt %d: %s", row, tries + 1, busy.message)
             return False
         except SkillsError as refused:
             return self._end(row, attempt, refused.words())
@@ -70,10 +76,20 @@ class Work:
 
     def _end(self, row: int, attempt: int, reason: str) -> bool:
         try:
-            fail(self.database, row, attempt, reason)
+            self._when_not_busy(row, lambda: fail(self.database, row, attempt, reason))
         except Exception:  # the watch finds that the workflow has ended and the row has not, and fails it then
             log.exception("Job %d: it failed, and that could not be written.", row)
         return True
+
+    def _when_not_busy(self, row: int, do: Callable[[], object]) -> None:
+        """Call a function until the database is not busy; it does nothing once the job has ended or was taken over."""
+        for waited in count():
+            try:
+                do()
+                return
+            except DatabaseBusy as busy:
+                log.warning("Job %d waits for the database: %s", row, busy.message)
+            time.sleep(min(FIRST_PAUSE_S * 4**waited, LONGEST_PAUSE_S))
 
 
 def start(database: Database, row: int, attempt: int) -> bool:

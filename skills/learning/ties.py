@@ -39,6 +39,7 @@ from skills.learning.dynamic_programming import Mdp
 STEPS = (0, 4294967296, 6074001000, 7439101574)  # lengths of moves along 0 to 3 axes, in 2^-32 of a cell
 NEVER = 2**62  # length of an approach that never enters a waypoint
 TIE = 1e-9  # relative; two actions closer than this are equally good (a Q value carries about 1e-15 of rounding)
+OPTIMAL = "optimal to 1e-9 of their value"  # of actions: as `TIE` tells them apart, wherever they are counted
 NM_PER_MM = 1e6
 
 

@@ -11,9 +11,11 @@ from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from sqlalchemy import update
+from sqlalchemy import select, update
 
+from skills.client import Client, Retrying
 from skills.db import now
+from skills.db.models import Demonstration
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import NotReady
@@ -99,12 +101,40 @@ def test_a_signing_key_that_is_missing_or_unreadable_is_named(installation: Sett
 def test_samples_that_cannot_be_loaded_are_told_in_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def refuse(_client: object) -> None:
+    def refuse(*_: object) -> None:
         raise NotReady("The signing key is missing.")
 
     monkeypatch.setattr("skills.serving.load_samples", refuse)  # only a service that was damaged refuses them
     _load(Settings(), "")
-    assert capsys.readouterr().out == "The samples are not loaded: The signing key is missing.\n"
+    assert capsys.readouterr().out == (
+        "Some samples are not loaded or trained:\n  the service: The signing key is missing.\n"
+    )
+
+
+def test_a_sample_that_is_refused_leaves_the_others_to_be_trained(
+    service: Service, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    service.client.put_surgeon("heron")
+    service.client.erase_surgeon("heron")  # so it can never be added again
+    service.client.put_surgeon("wren")
+    train = Client.train
+
+    def refuse_wren(client: Client, surgeon: str, suture: str, **how: bool) -> object:
+        if surgeon == "wren":
+            raise NotReady("The queue cannot be used.")
+        return train(client, surgeon, suture, **how)
+
+    monkeypatch.setattr(Client, "train", refuse_wren)
+    monkeypatch.setattr("skills.serving.Client", lambda *_, **__: Client(service.http, retrying=Retrying(attempts=1)))
+    _load(Settings(), "")
+    said = capsys.readouterr().out
+    assert said.startswith("Some samples are not loaded or trained:\n  heron: ")
+    assert "was erased" in said
+    assert "  wren, " in said
+    assert "The queue cannot be used." in said
+    with service.database.reading() as session:
+        assert {demo.surgeon.slug for demo in session.scalars(select(Demonstration))} == {"kestrel", "plover", "wren"}
+        assert {job.request["surgeon"] for job in session.scalars(select(Job))} == {"kestrel", "plover"}
 
 
 def test_what_is_not_ready_is_a_problem_with_a_name(service: Service):

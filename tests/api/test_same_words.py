@@ -12,10 +12,12 @@ from typing import Any
 
 import pytest
 
+from skills.learning.ties import OPTIMAL
 from skills.settings import settings
-from tests.api.service import Service
+from tests.api.service import POLICY, Service
 from tests.api.test_plans import APPROACH, BASE, GOAL_MM, plan
 from tests.by_day import some
+from tests.library import cases
 
 FAR_MM, NEAR_MM = -175.0, -120.0
 BOX = {"low_mm": [58.0, 58.0, -122.0], "high_mm": [62.0, 62.0, -118.0]}
@@ -109,3 +111,8 @@ def test_all_doors_say_the_same_of_a_plan(
         readme = zipfile.ZipFile(io.BytesIO(bag.content)).read("README.txt").decode()
         assert f"Not judged: {', '.join(line['not_judged'])}." in readme
         assert made["description"] in readme
+
+
+def test_style_and_card_state_up_to_where_an_action_is_optimal(still: Service) -> None:
+    for path in (f"/pages/styles/kestrel/{cases.SUTURE}", f"{POLICY}/versions/1/card"):
+        assert OPTIMAL in text_of(still.http.get(path, headers={"Accept": "text/html"}).text), path

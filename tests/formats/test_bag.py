@@ -134,7 +134,7 @@ PLAIN = metadata(["x.mcap"], COUNTS).decode()
     ],
 )
 def test_metadata_that_are_no_bags_or_a_bomb_are_refused(text):
-    with pytest.raises(UnreadableRecording, match=r"^metadata\.yaml .*Remove it"):
+    with pytest.raises(UnreadableRecording, match=r"^metadata\.yaml .*Move it away"):
         read_metadata(text)
 
 

@@ -104,3 +104,22 @@ def test_other_json_with_comments_or_damage_is_left_aside_and_named(text, tmp_pa
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(data)
     assert find_bag(tmp_path / "s").left_aside == ("arms.json",)
+
+
+UNRELATED = {
+    "settings.json": '{\n  // of an editor\n  "frames": 30, "stages": ["build"]\n}',
+    "pipeline.json": '{"stages": ["build", "test"]}',
+    "plan.json": '{"stages": {"one": 1}, "frames": 3}',
+    "people.json": '{"stages": [{"title": "novice"}]}',
+    "half.json": '{"video_file": "left.mp4", ',
+}
+
+
+@pytest.mark.parametrize("name", UNRELATED)
+def test_somebodys_own_json_beside_a_bag_is_left_aside_and_stays(name, skills, tmp_path, monkeypatch):
+    (tmp_path / "b.mcap").write_bytes(write_mcap(recording()))
+    (tmp_path / name).write_text(UNRELATED[name])
+    monkeypatch.chdir(tmp_path)
+    said = skills.does("recording", "preview", ".")
+    assert f"{name} has no tags of a recorder: left aside." in said
+    assert "remove" not in said.lower()

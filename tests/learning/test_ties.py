@@ -18,7 +18,7 @@ from skills.learning.certificate import certify, mdp_of
 from skills.learning.dynamic_programming import ValueIteration, exact_q
 from skills.learning.policy import Policy, learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.ties import REMOTE_CENTRE, ShortestApproach, rule_in
+from skills.learning.ties import OPTIMAL, REMOTE_CENTRE, TIE, ShortestApproach, rule_in
 from tests.by_day import examples, some
 from tests.gridworld.paths import WALKS, learnt, named_path, random_path
 from tests.learning.loops import run_both
@@ -259,3 +259,7 @@ def test_the_compiled_rule_and_the_plain_one_agree(monkeypatch, learner, name):
     agreed = run_both(monkeypatch, ties, "find_equal", "choose_approaches", "count_off_rule")
     certify(learn_tabular(sparse_reward(named_path(name)), learner, seed=5))
     assert agreed == ["find_equal", "choose_approaches", "count_off_rule"]
+
+
+def test_the_words_for_an_optimal_action_state_the_resolution():
+    assert f"optimal to {TIE:.0e} of their value".replace("e-09", "e-9") == OPTIMAL

@@ -174,6 +174,16 @@ def test_a_policy_that_may_not_be_released_says_so_and_is_not(database: Database
     assert counted(database, Release) == 0
 
 
+@pytest.mark.needs("simulator")
+def test_a_try_that_releases_nothing_says_which_version_is_served(database: Database) -> None:
+    recording = stored(database)
+    assert steps(tried(database, recording, **ANSWERS))[-1]["text"] == "Version 1 is served now."
+    again = steps(tried(database, recording, **ANSWERS | {"release": False}))[-1]["text"]
+    assert again == "Version 1 is not released by this: that was not requested. Version 1 is served."
+    other = steps(tried(database, recording, **ANSWERS | {"release": False, "cell_mm": 4.0}))[-1]["text"]
+    assert other == "Version 2 is not released by this: that was not requested. Version 1 is served."
+
+
 def test_a_try_is_repeated_after_it_ended_and_not_before(database: Database) -> None:
     recording = stored(database)
     asked = TryIn(recording=recording[:12], surgeon="kestrel", suture=cases.SUTURE)

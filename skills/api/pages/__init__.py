@@ -21,6 +21,7 @@ from skills.api.pages.assets import build
 from skills.api.pages.filters import FILTERS
 from skills.api.responses import HTML
 from skills.formats import READABLE
+from skills.learning.ties import OPTIMAL
 
 # Scripts and styles only from our files, none inline. Swagger UI has images at `data:` URLs.
 SITE_POLICY = (
@@ -45,6 +46,7 @@ def templates() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= FILTERS
+    made.globals["optimal"] = OPTIMAL
     made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": to_jsonable_python}  # values and models too
     return made
 

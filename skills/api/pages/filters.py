@@ -4,12 +4,17 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
 from math import degrees
+from typing import Any
 
 from skills.arrays import Floats
 from skills.db.models import Surgeon, SutureType
+from skills.db.service_tables import Job
 from skills.library.operation.styles import StyleState
 from skills.library.plans.headline import describe_error
 from skills.schemas.people import SurgeonIn, SutureTypeIn
+from skills.schemas.playbacks import PlaybackIn
+from skills.schemas.training import RetrainingIn, TrainingIn
+from skills.schemas.tries import TryIn
 
 MISSING = "–"
 STATE_MARKS = {"released": "●", "trained": "◐", "stored": "○", "empty": "·"}
@@ -129,7 +134,25 @@ def as_request(row: Surgeon | SutureType) -> dict[str, object]:
     return {"slug": row.slug, **model.model_validate(row, from_attributes=True).model_dump(mode="json")}
 
 
+AGAIN: Any = {"training": TrainingIn, "retraining": RetrainingIn, "playback": PlaybackIn, "try": TryIn}
+
+
+def again(job: Job) -> tuple[str, dict[str, object]] | None:
+    """Return the call that requests a job again, and its body; None for an export, whose filters are not stored."""
+    if job.kind == "pictures":
+        return f"POST /playbacks/{job.request['playback']}/pictures", {}
+    if job.kind not in AGAIN:
+        return None
+    scene = job.request.get("surroundings", {})
+    stored = {**job.request, "scene": scene.get("scene"), "scene_costs": scene.get("costs")}
+    # What the request left open: the learners of a batch's styles, the errors of the arms.
+    left_open = "learner" if "joins" in stored else "errors" if stored.get("stated_by") == "installation" else ""
+    named = [name for name in AGAIN[job.kind].model_fields if name != left_open and stored.get(name) is not None]
+    return f"POST /{'tries' if job.kind == 'try' else f'{job.kind}s'}", {name: stored[name] for name in named}
+
+
 FILTERS = {
+    "again": again,
     "as_request": as_request,
     "px": px,
     "points": points,

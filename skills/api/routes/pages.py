@@ -120,12 +120,12 @@ def show_catalogue(
     skill: Literal["", "novice", "intermediate", "expert"] = "",
     cursor: SlugCursor = None,
 ) -> Response:
-    """Show the styles: surgeons and suture types, with their stored, trained and released state."""
+    """Show the styles: surgeons and suture types, with their stored, trained and released state, and jobs."""
     with page.db.reading() as session:
         found = styles.matrix(session, q, state or None, skill or None, cursor)
         asked = {"q": q, "state": state, "skill": skill}
-        sutures, most = overview.all_suture_types(session), styles.MOST_COUNTED
-        return page.show("catalogue.html", found=found, asked=asked, sutures=sutures, most_counted=most)
+        lists = {"sutures": overview.all_suture_types(session), "jobs": overview.unsettled_jobs(session)}
+        return page.show("catalogue.html", found=found, asked=asked, most_counted=styles.MOST_COUNTED, **lists)
 
 
 @router.get("/pages/styles/{surgeon}/{suture}", dependencies=[needs("reader")])

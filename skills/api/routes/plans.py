@@ -158,7 +158,9 @@ def _contents(
         motion = motion_of(session, plan)
     trajectory = trajectory_of(motion)
     rows = _rows(trajectory, pass_index)
-    return _table(rows) if media_type == TABLE else _json(rows, trajectory.rate_hz)
+    if media_type == TABLE:
+        return _table(rows)
+    return orjson.dumps({"rate_hz": trajectory.rate_hz, "columns": COLUMNS.split(","), "rows": rows})
 
 
 def _rows(trajectory: Trajectory, pass_index: int | None) -> list[list[Any]]:
@@ -174,7 +176,3 @@ def _table(rows: list[list[Any]]) -> bytes:
     writer.writerow(COLUMNS.split(","))
     writer.writerows(rows)
     return out.getvalue().encode()
-
-
-def _json(rows: list[list[Any]], rate_hz: float) -> bytes:
-    return orjson.dumps({"rate_hz": rate_hz, "columns": COLUMNS.split(","), "rows": rows})

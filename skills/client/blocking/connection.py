@@ -6,7 +6,6 @@ import random
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from math import isfinite
 from pathlib import Path
 from string import Formatter
 from typing import Any, TypeVar
@@ -20,7 +19,7 @@ from skills.client.blocking.waiting import in_thread, upload_body
 from skills.client.files import CHUNK_BYTES, Download, FileUpload, Progress, check_digest, digest_of_etag
 from skills.client.problems import NotReached, NotUnderstood, Problem, problem_of, showing_given
 from skills.client.retrying import Retrying, may_repeat
-from skills.errors import BadInput
+from skills.errors import refuse_not_finite
 from skills.schemas import Page
 
 PAGE_LENGTH = 200  # the longest page that the service returns
@@ -83,7 +82,7 @@ class Connection:
     ) -> httpx.Response:
         content = None if body is None else to_jsonable_python(given(body), fallback=_plain)
         target, query = fill(path, named)
-        _refuse_not_finite({**query, **(content or {})})
+        refuse_not_finite({**query, **(content or {})})
         with showing_given({**named, **(content or {})}):
             return self._send(
                 method, target, idempotent=idempotent, params=query, json=content, headers={"Accept": accept}
@@ -230,19 +229,6 @@ def fill(path: str, named: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
 def given(values: Mapping[str, T]) -> dict[str, T]:
     """Return the entries that are not None."""
     return {name: value for name, value in values.items() if value is not None}
-
-
-def _refuse_not_finite(value: Any, path: tuple[str, ...] = ()) -> None:
-    """Refuse a number that JSON does not have.
-
-    Raises:
-        BadInput: There is one; the message says where.
-    """
-    if isinstance(value, float) and not isfinite(value):
-        raise BadInput(f"{'.'.join(path)} is {value}; every number must be finite.")
-    named = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list | tuple) else ()
-    for name, part in named:
-        _refuse_not_finite(part, (*path, str(name)))
 
 
 def as_json(answer: httpx.Response) -> Any:

@@ -14,18 +14,19 @@ even if several workers train it. The batch ends in the same transaction as its 
 
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict
 from sqlalchemy import ColumnElement, ScalarSelect, Select, Table, delete, exists, func, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import ALL_ROWS
 from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_event
 from skills.db.session import Database
-from skills.errors import Conflict, NotFound, TooMany
+from skills.errors import Conflict, DatabaseBusy, NotFound, TooMany
 from skills.library.operation import locks
 from skills.library.people.consent import require
 from skills.library.policies.releases import is_served
@@ -250,7 +251,7 @@ def progress_callback(database: Database, request: JobRequest) -> Callable[[floa
     mine = (Job.identity == request.identity, Job.state == "running")
 
     def tell(share: float) -> None:
-        with database.writing(()) as session:
+        with suppress(DatabaseBusy), database.writing(()) as session:  # the next one is stored; the work is not lost
             session.execute(update(Job).where(*mine).values(progress=share), **UNSYNCHRONISED)
 
     return tell
@@ -287,6 +288,12 @@ def shown() -> list[ColumnElement[bool]]:
     # A scalar and not `exists`, which PostgreSQL may turn into a join, for which it reads and sorts all jobs.
     of_job = select(erased).where(erased == Job.surgeon_row).correlate(Job).scalar_subquery()
     return [Job.kind != PART, of_job.is_(None)]
+
+
+def requested_again() -> ColumnElement[bool]:
+    """Return a condition on `Job`: there is a later job with the same request."""
+    later = aliased(Job)
+    return exists().where(later.identity == Job.identity, later.row > Job.row).correlate(Job)
 
 
 def newest(session: Session, request: JobRequest) -> Job | None:

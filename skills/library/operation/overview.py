@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from skills.db import newest
+from skills.db import newest, now
 from skills.db.models import (
     Demonstration,
     Plan,
@@ -17,9 +18,11 @@ from skills.db.models import (
     SutureType,
 )
 from skills.db.service_tables import Job
+from skills.library.operation.jobs import ACTIVE, requested_again, shown
 from skills.library.plans.playback_pictures import job_of_pictures
 
 MOST = 50  # rows of a list on a page
+MOST_UNSETTLED, FAILED_DAYS = 10, 7  # ours: jobs on the first page, and for how long a failed one stands there
 MOST_LISTED = 200  # of a style's versions and demonstrations, or in a selection, where of more nobody chooses by eye
 
 
@@ -79,6 +82,14 @@ def playbacks_of(session: Session, plan: Plan) -> list[Played]:
         drawn = session.scalar(select(StoredPictures.row).where(StoredPictures.playback_row == one.row)) is not None
         listed.append(Played(one, drawn, None if drawn else job_of_pictures(session, one)))
     return listed
+
+
+def unsettled_jobs(session: Session) -> list[Job]:
+    """List the first jobs that have not ended, then the newest that failed lately and were not requested again."""
+    active = select(Job).where(*shown(), Job.state.in_(ACTIVE)).order_by(Job.row)
+    lately = Job.state == "failed", Job.ended_at > now() - timedelta(days=FAILED_DAYS), ~requested_again()
+    failed = newest(Job, *shown(), *lately, limit=MOST_UNSETTLED)
+    return [*session.scalars(active.limit(MOST_UNSETTLED)), *session.scalars(failed)]
 
 
 def newest_job(session: Session, kind: str, plan: str) -> Job | None:

@@ -13,6 +13,8 @@ from sqlalchemy.orm import Session
 
 from skills.db import newest
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release, Surgeon, SutureType
+from skills.db.service_tables import Job
+from skills.library.operation.jobs import ACTIVE, TRAINING, requested_again
 from skills.library.operation.overview import MOST, MOST_LISTED
 from skills.library.people.surgeons import find_surgeon
 from skills.library.people.suture_types import find_suture_type
@@ -40,7 +42,8 @@ class StyleState:
     """The state of one style: the numbers of active demonstrations and versions, the served version and the shown one.
 
     `shown` is of the served version or, if none is served, of the newest; `waiting` is true if the newest demonstration
-    is newer than those of the shown version.
+    is newer than those of the shown version; `job` is the newest training that has not ended, or that failed
+    and left the style without a version.
     """
 
     suture: str
@@ -50,6 +53,7 @@ class StyleState:
     released: int | None = None
     shown: Shown | None = None
     waiting: bool = False
+    job: Job | None = None
 
 
 @dataclass(frozen=True)
@@ -160,16 +164,21 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     others = select(func.max(PolicyDemonstration.demonstration_row)).where(PolicyDemonstration.policy_row == by.row)
     about = select(by.row, by.version, by.demonstration_row, others.scalar_subquery(), *manifest)
     told = {row: rest for row, *rest in session.execute(about.where(by.row.in_(wanted.values())))}
+    asked = select(Job).where(Job.surgeon_row.in_(surgeons), Job.kind == TRAINING, Job.state.in_((*ACTIVE, "failed")))
+    asked = asked.where(~requested_again()).order_by(Job.row)
+    jobs = {(job.surgeon_row, job.request["suture"]): job for job in session.scalars(asked)}
     return {
-        style: _sum_up(style, demos, versions, told.get(wanted.get(style, 0)), style in released)
+        style: _sum_up(style, demos, versions, told.get(wanted.get(style, 0)), style in released, jobs.get(style))
         for style in demos.keys() | versions.keys()
     }
 
 
-def _sum_up(style: _Row, demos: _Counts, versions: _Counts, told: list[Any] | None, released: bool) -> StyleState:
+def _sum_up(
+    style: _Row, demos: _Counts, versions: _Counts, told: list[Any] | None, released: bool, job: Job | None
+) -> StyleState:
     count, newest = demos.get(style, (0, 0))
     if told is None:
-        return StyleState(style[1], "stored", count)
+        return StyleState(style[1], "stored", count, job=job)
     version, demonstration_row, other, shape, *shown = told
     return StyleState(
         suture=style[1],
@@ -179,6 +188,7 @@ def _sum_up(style: _Row, demos: _Counts, versions: _Counts, told: list[Any] | No
         released=version if released else None,
         shown=Shown(tuple(shape), *shown),
         waiting=newest > max(demonstration_row, other or 0),
+        job=None if job is None or job.state == "failed" else job,
     )
 
 

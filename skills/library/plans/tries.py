@@ -28,10 +28,11 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.segments import Segment
-from skills.errors import BadSettings, Conflict, SkillsError
+from skills.errors import BadSettings, Conflict, DatabaseBusy, SkillsError
 from skills.formats.parsed import ParsedContent
 from skills.gridworld import paper
 from skills.gridworld.grid import PathReport, choose_grid, describe_path, discretize
+from skills.learning.ties import OPTIMAL
 from skills.library.operation import jobs, locks
 from skills.library.operation.jobs import JobRequest, RequestedJob, Store
 from skills.library.people.consent import require
@@ -173,6 +174,8 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         yield _release(
             database, version, actor, settings, wanted=asked.release is True, passes=passes, feasible=feasible
         )
+    except DatabaseBusy:  # refuses nothing: the job waits and begins again
+        raise
     except SkillsError as refused:
         if isinstance(least_mm := refused.numbers.get("least_mm"), float):
             reached_mm = ceil(10 * least_mm) / 10
@@ -345,7 +348,7 @@ def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:
     near = certificate.near
     optimal = certificate.states_checked - certificate.suboptimal_actions
     text = (
-        f"{optimal} of {certificate.states_checked} actions are optimal, {coverage.starts_reaching_goal} of "
+        f"{optimal} of {certificate.states_checked} actions are {OPTIMAL}, {coverage.starts_reaching_goal} of "
         f"{coverage.n_states} starts reach the goal, and each within {near.radius_mm:g} mm of the demonstrated "
         f"one follows at least {near.share:.0%} of the demonstration (limit {near.least_share:.0%})."
     )
@@ -406,16 +409,19 @@ def _release(
     feasible: bool,
 ) -> TryStep:
     """Release a version if that is wanted, it passes the gate, and its plan is feasible; a refusal ends no try."""
+    with database.reading() as session:
+        served = releases.served(session, version.surgeon, version.suture)
+        now = "" if served is None else f" Version {served.policy.version} is served."
     if not (wanted and passes and feasible):
         plan = "its plan is not feasible; release it by its number if it is to be served all the same"
         why = "it does not pass the gate" if not passes else "that was not requested" if not wanted else plan
-        return _done("release", f"Version {version.version} is not released: {why}.")
+        return _done("release", f"Version {version.version} is not released by this: {why}.{now}")
     try:
         with database.writing([locks.surgeon(version.surgeon.slug)]) as session:
             stored = session.get_one(PolicyVersion, version.row)
             releases.release(session, stored, actor, constant_turn_deg=settings.constant_turn_deg)
     except Conflict as refused:
-        return _refused("release", refused, ())
+        return _refused("release", refused, ()).model_copy(update={"text": refused.message + now})
     return _done("release", f"Version {version.version} is served now.", version.sha256)
 
 

@@ -17,6 +17,7 @@ from skills.learning.certificate import (
 from skills.learning.dynamic_programming import FAINT
 from skills.learning.policy import Policy
 from skills.learning.pose_step import near_share
+from skills.learning.ties import OPTIMAL
 from skills.learning.tube import CertifiedPoses
 from skills.planning.plan import CONSTANT_TURN_DEG, DrivenPass, driven_pass
 from skills.schemas.policies import GateRefusal, RefusalKind
@@ -87,7 +88,7 @@ def refusals(
 def _inexact(policy: Policy, certificate: Certificate) -> Iterator[tuple[RefusalKind, str]]:
     """Yield the reasons why actions and starts are against a release."""
     if not certificate.every_action_optimal:
-        yield "not optimal", f"{certificate.suboptimal} of {certificate.checked} greedy actions are not optimal"
+        yield "not optimal", f"{certificate.suboptimal} of {certificate.checked} greedy actions are not {OPTIMAL}"
     if not certificate.every_action_optimal and certificate.faint:
         gamma = least_gamma(policy)
         yield (
