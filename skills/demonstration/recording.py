@@ -39,6 +39,7 @@ from skills.kinematics import matrix_of, quaternion_of
 from skills.quaternions import INVERSE, angle_of, best_turn, multiplied, turned, unit
 from skills.remedies import did_you_mean
 
+NS_PER_S = 1_000_000_000
 BASES_LIMIT = 64  # ours: pairs of motions of one arm in two frames; a dVRK's recording has one or two per arm
 PAIR_NS = 2_000_000  # ours: between two poses so near in time a tip at 100 mm/s moves by 0.2 mm
 PAIRS_LEAST = 10  # ours: from fewer pairs it cannot be concluded that a base stood still

@@ -35,7 +35,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from skills.arrays import Ints
-from skills.demonstration.recording import Motion, Recording, Signal
+from skills.demonstration.recording import NS_PER_S, Motion, Recording, Signal
 from skills.errors import BadRecording
 from skills.formats import topics
 from skills.formats.archive import pack
@@ -44,7 +44,6 @@ from skills.formats.mcap.reader import NOTES
 from skills.formats.topics import BOOL, FLOAT64, JOINT_STATE, JOY, POSE, STRING
 from skills.verification.timeline import ArmTrack, Timeline
 
-_NANO = 1_000_000_000
 _MESSAGES = files("skills.formats") / "messages"  # ROS's own definitions, with those of nested messages
 DEFINITIONS = {
     kind: (_MESSAGES / f"{kind.rpartition('/')[2]}.msg").read_text()
@@ -141,7 +140,7 @@ class _Body:
 
     def header(self, stamp_ns: int, frame: str) -> Self:
         """Append a std_msgs/Header."""
-        return self.put("i", stamp_ns // _NANO).put("I", stamp_ns % _NANO).text(frame)
+        return self.put("i", stamp_ns // NS_PER_S).put("I", stamp_ns % NS_PER_S).text(frame)
 
 
 @dataclass

@@ -28,7 +28,7 @@ import apsw
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Format, Integrity, Recording, Topic
+from skills.demonstration.recording import NS_PER_S, Format, Integrity, Recording, Topic
 from skills.errors import BackwardStamps, NoUsableTopic, UnreadableRecording
 from skills.formats import topics
 from skills.formats.archive import printable, refusing
@@ -152,7 +152,6 @@ DB3_MAGIC = b"SQLite format 3\0"
 Suffix = Literal[".bag", ".db3", ".mcap"]
 _FORMATS: dict[Suffix, Format] = {".bag": "rosbag1", ".db3": "rosbag2", ".mcap": "mcap"}
 _NAMES = {".bag": "ROS 1 bag", ".db3": "SQLite bag (.db3)", ".mcap": "MCAP file"}
-_NANO = 1_000_000_000
 
 guard_connections()
 
@@ -299,7 +298,7 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
         for connection, _, data in reader.messages(connections=wanted):
             said: Any = reader.deserialize(data, connection.msgtype)
             place = _PLACES[connection.msgtype](said)
-            stamps.append(int(said.header.stamp.sec) * _NANO + int(said.header.stamp.nanosec))
+            stamps.append(int(said.header.stamp.sec) * NS_PER_S + int(said.header.stamp.nanosec))
             places.append((place.x, place.y, place.z))
     place_mm = 1000.0 * np.array(places, np.float64).reshape(-1, 3)
     seen = np.isfinite(place_mm).all(axis=1)  # a tracker that has lost its marker says NaN
