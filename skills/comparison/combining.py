@@ -43,7 +43,7 @@ from skills.arithmetic import product
 from skills.arrays import Floats, freeze, frozen
 from skills.comparison.distances import TREMOR_S, distances, medoid, placed, resampled
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.movement import smoothed_tip
+from skills.demonstration.movement import lengths_along, smoothed_tip
 from skills.errors import BadInput, BadPath
 from skills.gridworld.grid import GridPath, choose_grid, discretize
 from skills.kinematics import matrix_of, quaternion_of
@@ -230,7 +230,7 @@ def demonstrated(combined: Combined, newest: Demo) -> Demo:
         newest: The demonstration that gives arm, frame, duration, rotations and jaw angles, at equal parts of its
             length.
     """
-    along_mm = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(newest.tip_mm, axis=0), axis=1)))
+    along_mm = lengths_along(newest.tip_mm)
     alike = np.searchsorted(along_mm, np.linspace(0.0, along_mm[-1], len(combined.tip_mm))).clip(0, len(along_mm) - 1)
     return replace(
         newest,

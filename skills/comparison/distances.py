@@ -37,7 +37,7 @@ from skills.arithmetic import product
 from skills.arrays import Floats, Ints, freeze, frozen, interpolated
 from skills.compiled import compiled, inner
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.movement import smoothed_tip
+from skills.demonstration.movement import lengths_along, smoothed_tip
 from skills.errors import BadInput, BadPath
 from skills.learning.evaluation import dtw
 
@@ -87,7 +87,7 @@ def resampled(tip_mm: Floats, states: int = STATES) -> Floats:
         tip_mm: The path, shape (T, 3).
         states: Number of points, the ends included.
     """
-    along_mm = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    along_mm = lengths_along(tip_mm)
     at_mm = np.linspace(0.0, along_mm[-1], states)
     return interpolated(at_mm, along_mm, tip_mm)
 
@@ -156,6 +156,7 @@ def distances_of(shapes: ArrayLike, pairs: ArrayLike) -> Floats:
 
 
 def _measured(paths: Floats, references: Floats, pairs: Ints) -> Floats:
+    """Return the distance between a path, (N, T, 3), and a reference, (M, R, 3), of each pair, (K, 2): shape (K,)."""
     chosen = frozen(pairs, np.int64, (None, 2), "pairs")
     totals = np.empty(len(chosen))
 
@@ -301,6 +302,7 @@ class Difference:
 
     @property
     def _most(self) -> tuple[int, int]:
+        """The third of the path and the axis with the largest share, as indices."""
         part, axis = np.unravel_index(int(self.shares.argmax()), self.shares.shape)
         return int(part), int(axis)
 

@@ -116,10 +116,12 @@ class ShapeIndex:
         threads = min(THREADS, 1 + size // WORTH_A_THREAD)
 
         def bound(start: int, end: int) -> None:
+            """Fill the bounds of the shapes from `start` to `end`."""
             room = np.empty(TOGETHER), np.empty((COARSE, TOGETHER))
             bound_all(coarse_boxes, STATES / COARSE, self._coarse, lengths, start, end, *room, bounds)
 
         def search(order: Ints) -> tuple[Ints, Floats]:
+            """Return the places and totals of the nearest shapes among those of an order, and of those known before."""
             found, totals = np.full(count, -1), np.full(count, np.inf)
             found[: len(known[0])], totals[: len(known[0])] = known
             room = np.empty((6, FINE)), np.empty((3, STATES + 1)), np.empty((2, FINE, STATES))
@@ -128,6 +130,7 @@ class ShapeIndex:
             return found[found >= 0], totals[found >= 0]
 
         def search_all(places: Ints) -> tuple[Ints, Floats]:
+            """Return the places and totals of the nearest shapes among some places, on all threads."""
             order = places[np.argsort(bounds[places], kind="stable")]
             # Dealt out in turn, so that each thread finds near ones soon; each has those that were known before.
             pairs = list(pool.map(search, (np.ascontiguousarray(order[at::threads]) for at in range(threads))))

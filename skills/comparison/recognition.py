@@ -94,6 +94,7 @@ def signature_of(demo: Demo) -> Floats:
 
 
 def _shape(tip_mm: Floats) -> Floats | None:
+    """Return the numbers of `shape`, (15,); None for a path without a direction."""
     try:
         shape_mm = placed(resampled(tip_mm))
     except BadPath:
@@ -102,6 +103,7 @@ def _shape(tip_mm: Floats) -> Floats | None:
 
 
 def _tempo(seconds: Floats, tip_mm: Floats) -> Floats:
+    """Return the numbers of `tempo`, (11,), of a smoothed path, (N, 3), at even times, (N,)."""
     duration_s, step_s = float(seconds[-1]), float(seconds[1] - seconds[0])
     velocity = np.gradient(tip_mm, step_s, axis=0)
     acceleration = np.gradient(velocity, step_s, axis=0)
@@ -130,6 +132,7 @@ def _tempo(seconds: Floats, tip_mm: Floats) -> Floats:
 
 
 def _jaw(stamps_s: Floats, jaw_rad: Floats) -> Floats:
+    """Return the numbers of `jaw`, (13,), of angles in rad, (T,), at stamps in s, (T,)."""
     seconds, smooth = smoothed_tip(stamps_s, jaw_rad[:, None], TREMOR_S)
     angle = smooth[:, 0]
     changes = float(np.abs(np.diff(angle)).sum()) / float(seconds[-1])
@@ -234,6 +237,7 @@ class Metric:
         return np.asarray(self._from(signatures, self.learnt).min(axis=1))
 
     def _from(self, signatures: Floats, points: Floats) -> Floats:
+        """Return the squared distance of signatures, (M, NUMBERS), from points in the metric, (K, F): shape (M, K)."""
         there = (signatures[:, self.settings.columns] - self.centre) @ self.into
         squared = (there**2).sum(axis=1)[:, None] - 2.0 * there @ points.T + (points**2).sum(axis=1)
         return np.asarray(squared.clip(0.0))
@@ -508,6 +512,7 @@ def _fit_logistic(known: Floats, unknown: Floats, surgeons: int) -> Floats:
 
 
 def _logistic(stranger_fit: Floats, x: Floats | float) -> Floats:
+    """Return the probability of being a stranger at logarithms of the distance, of any shape."""
     return np.asarray(1.0 / (1.0 + np.exp(-(stranger_fit[0] + stranger_fit[1] * x))))
 
 
@@ -592,6 +597,7 @@ def calibrate(away: Floats, truth: Ints) -> tuple[float, float]:
     of_truth = further[np.arange(len(truth)), truth]
 
     def loss(reciprocal: float) -> float:
+        """Return the mean of -log p of the true surgeon with a reciprocal of the temperature."""
         return float((of_truth * reciprocal + np.log(np.exp(-further * reciprocal).sum(axis=1))).mean())
 
     from scipy.optimize import minimize_scalar  # here, because it is slow to import

@@ -22,9 +22,9 @@ from skills.demonstration.partner import Partner, PartnerMotion, in_base, partne
 from skills.demonstration.plausible import check_steps
 from skills.demonstration.recording import BaseFrame, Motion, Recording, base_frames
 from skills.errors import BadSegment, JointsDisagree, NotMetres
+from skills.kinematics import DEFAULT_INSTRUMENT
 from skills.notebook import card
 
-CLASSIC_LARGE_NEEDLE_DRIVER = "400006"  # the dVRK's tool number, if the recording neither shows nor states one
 EXTENT_LIMITS_MM = (1.0, 300.0)  # less: metres declared as millimetres; more: beyond a PSM's reach
 PAUSES_LIMIT = 200  # ours: no hand-off has so many, and the motion between two of them is measured separately
 EDGE_NS = 1000  # tolerance at the recording's ends, for times in seconds that were rounded
@@ -47,7 +47,7 @@ class Demo:
             sample. None if not recorded.
         clutch_presses: Number of presses of the clutch pedal within the segment; quick taps do not count.
         instrument: The tool's number in the dVRK's files, as joints and poses show it, or as the recording states it;
-            "400006-Si" on an arm of the other generation.
+            "400006-Si" on an arm of the other generation. `DEFAULT_INSTRUMENT` if it is neither shown nor stated.
         pauses: The intervals between the first and the last sample in which the arm was not driven.
         partner: Pose of the other arm as it takes the needle, in `frame`; None if no other arm is near or its pose
             cannot be expressed in `frame`.
@@ -63,7 +63,7 @@ class Demo:
     rotation_xyzw: Floats | None = None
     jaw_rad: Floats | None = None
     clutch_presses: int = 0
-    instrument: str = CLASSIC_LARGE_NEEDLE_DRIVER
+    instrument: str = DEFAULT_INSTRUMENT
     pauses: tuple[Pause, ...] = ()
     partner: Partner | None = None
 
@@ -154,7 +154,7 @@ def cut_demo(
         rotation_xyzw=rotation_xyzw,
         jaw_rad=_jaw_at(recording, motion.arm, seconds),
         clutch_presses=sum(first_ns <= down_ns <= last_ns for down_ns, _ in clutched(recording)),
-        instrument=recording.instrument_on(motion.arm) or CLASSIC_LARGE_NEEDLE_DRIVER,
+        instrument=recording.instrument_on(motion.arm) or DEFAULT_INSTRUMENT,
         pauses=_pauses(recording, motion.arm, int(stamps_ns[0]), int(stamps_ns[-1])),
         partner=partner,
     )
@@ -237,6 +237,11 @@ def _pauses(recording: Recording, arm: str, first_ns: int, last_ns: int) -> tupl
 
 
 def _segment_ns(recording: Recording, motion: Motion, start_s: float | None, end_s: float | None) -> tuple[int, int]:
+    """Return the first and the last moment of a segment, in the recording's own nanoseconds.
+
+    Raises:
+        BadSegment: It is not finite, ends before it starts or lies outside the recording, or the motion has one sample.
+    """
     for name, value in (("start_s", start_s), ("end_s", end_s)):
         if value is not None and not np.isfinite(value):
             raise BadSegment(f"{name} is {value}; give seconds from the recording's start.")
@@ -268,6 +273,11 @@ def _segment_ns(recording: Recording, motion: Motion, start_s: float | None, end
 
 
 def _check_extent(topic: str, tip_mm: Floats) -> None:
+    """Refuse positions, (T, 3), whose extent along every axis is below, or along one above, `EXTENT_LIMITS_MM`.
+
+    Raises:
+        NotMetres: It is.
+    """
     extent_mm = float(np.ptp(tip_mm, axis=0).max())
     least, most = EXTENT_LIMITS_MM
     if least <= extent_mm <= most:
@@ -284,6 +294,7 @@ def _check_extent(topic: str, tip_mm: Floats) -> None:
 
 
 def _jaw_at(recording: Recording, arm: str, seconds: Floats) -> Floats | None:
+    """Return the angle of an arm's jaw at some times, shape (T,), in rad; None if none was recorded."""
     jaw = recording.jaw_of(arm)
     if jaw is None or len(jaw.values) == 0:
         return None

@@ -54,6 +54,7 @@ class Hypothesis:
 
 
 def _hypotheses() -> tuple[Hypothesis, ...]:
+    """Return the hypotheses, each with the names of all arms with instruments that have its lengths."""
     found: dict[tuple[float, float], list[str]] = {}
     for made_for, by_wrist in _NUMBERS.items():
         for wrist_mm, numbers in by_wrist.items():

@@ -188,10 +188,12 @@ class _Fit:
 
     @property
     def residual_mm(self) -> float:
+        """Root mean square of the distances."""
         return float(np.sqrt((self.away_mm**2).mean()))
 
     @property
     def is_good(self) -> bool:
+        """Whether the hypothesis explains positions and orientations."""
         # NaN is not good.
         return self.residual_mm <= FIT_MM and self.residual_rad <= FIT_RAD
 
@@ -261,6 +263,7 @@ def identify(
 
 
 def _fits(poses: _Poses) -> Iterator[_Fit]:
+    """Yield every hypothesis with the transform that fits it best."""
     for one in hypotheses.HYPOTHESES:
         yield _fit(poses, one)
 
@@ -321,7 +324,7 @@ def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) ->
     """Decide among the hypotheses, fitted to some samples, of which the first fits; `best` is fitted to all."""
     near = [fit for fit in fits if not _is_distinguishable(fit, fits[0])]
     others = [fit for fit in fits if fit not in near]
-    if poses.in_base and (moved := _beside_the_base(poses, best)) is not None:
+    if poses.in_base and (moved := _beside_the_base(poses, best, stated)) is not None:
         return moved
     stood = [name for fit in near for name in fit.of.names if _reaches(poses.joints, name)]
     found = _identified(
@@ -363,23 +366,22 @@ def _reaches(joints: Floats, name: str) -> bool:
     return bool(((joints[:, :3] >= low) & (joints[:, :3] <= high)).all())
 
 
-def _beside_the_base(poses: _Poses, best: _Fit) -> Identification | None:
-    """Return the verdict that poses stated to be in the base are a small way off it; None if they are in it."""
+def _beside_the_base(poses: _Poses, best: _Fit, stated: str | None) -> Identification | None:
+    """Return the verdict that poses stated to be in the base are up to `FIT_MM` off it; None if they are in it."""
     free = _fit(replace(poses, in_base=False), best.of)
     within = max(MARGIN * free.residual_mm, free.residual_mm + 0.1)
-    if best.residual_mm <= within:
-        return None
-    return _wrong_frame(poses, free)
+    return None if best.residual_mm <= within else _wrong_frame(poses, free, stated)
 
 
-def _wrong_frame(poses: _Poses, free: _Fit) -> Identification:
+def _wrong_frame(poses: _Poses, free: _Fit, stated: str | None) -> Identification:
+    """Return the verdict that poses stated to be in the base are in another frame, to which `free` leads from it."""
     x, y, z = free.position_mm.tolist()
     turn = np.degrees(arccos(np.clip((np.trace(free.rotation) - 1.0) / 2.0, -1.0, 1.0)))
     reason = (
         f"the poses are stated to be relative to the arm's base, but the joints put the base at ({x:.1f}, {y:.1f}, "
         f"{z:.1f}) mm in their frame, turned by {turn:.1f} degrees"
     )
-    return _identified(replace(poses, in_base=False), free, "wrong frame", [], None, reason=reason)
+    return _identified(replace(poses, in_base=False), free, "wrong frame", [], stated, reason=reason)
 
 
 def _identified(
@@ -391,6 +393,7 @@ def _identified(
     next_mm: float | None = None,
     reason: str = "",
 ) -> Identification:
+    """Return a verdict with the numbers of a fit; of some instruments the stated one is named first."""
     preferred = hypotheses.matching(names, stated) if stated is not None else []
     candidates = tuple(dict.fromkeys(preferred + names))
     first = candidates[0] if candidates else None
@@ -414,12 +417,14 @@ def _identified(
 
 
 def _is_identity(fit: _Fit) -> bool:
-    """Return whether the fitted transform is none, within the residual."""
+    """Return whether the fitted transform moves nothing, within the residual."""
+    # A turn moves the tip, which is up to about 200 mm from the remote centre.
     away = np.linalg.norm(fit.position_mm, axis=-1) + 200.0 * np.abs(fit.rotation - np.eye(3)).max()
     return bool(away <= max(MARGIN * fit.residual_mm, 0.1))
 
 
 def _describe_candidates(found: Identification) -> str:
+    """Return the first four candidates and the number of the others, in words."""
     shown = ", ".join(found.candidates[:4])
     more = len(found.candidates) - 4
     return f"{shown} and {more} more" if more > 0 else shown or "no arm whose joints reach so far"
@@ -433,7 +438,7 @@ def _not_explained(poses: _Poses, best: _Fit, stated: str | None) -> Identificat
     if poses.in_base:
         free = min(_fits(replace(poses, in_base=False)), key=_misfit)
         if free.is_good:
-            return replace(_wrong_frame(poses, free), stated=stated)
+            return _wrong_frame(poses, free, stated)
     elif _fits_in_pieces(poses):
         reason = "each part of the recording fits by itself, but not all together: the frame of the poses moved"
         return _identified(poses, best, "moved frame", [], stated, reason=reason)
@@ -447,7 +452,7 @@ def _not_explained(poses: _Poses, best: _Fit, stated: str | None) -> Identificat
     return _identified(poses, best, "contradiction", [], stated, reason=reason)
 
 
-_BETTER = FIT_MM + LEVER_MM * FIT_RAD
+_BETTER = FIT_MM + LEVER_MM * FIT_RAD  # the `_misfit` of a hypothesis that just fits
 
 
 def _fits_in_pieces(poses: _Poses) -> bool:
@@ -473,7 +478,6 @@ def _fits_in_pieces(poses: _Poses) -> bool:
 def _explanations(poses: _Poses) -> Iterator[tuple[str, _Poses]]:
     """Yield mistakes that recorders make, in words, with the poses as they are without the mistake."""
     angles = np.array([0, 1, 3, 4, 5])
-
     for words, factor in (("degrees", np.pi / 180.0), ("radians", 180.0 / np.pi)):
         joints = poses.joints.copy()
         joints[:, angles] *= factor

@@ -141,6 +141,7 @@ def check_forwards(topic: str, stamps_ns: Ints) -> None:
 
 
 def _at(stamps_ns: Ints, index: int) -> str:
+    """Return the time of a sample since the first one, in words."""
     return f"at {(int(stamps_ns[index]) - int(stamps_ns[0])) / 1e9:.3f} s"
 
 

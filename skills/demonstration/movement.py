@@ -81,7 +81,8 @@ class Movement:
         """Return the angle between the orientations at two times in s; 0 if no orientation was recorded."""
         if self.rotation_xyzw is None:
             return 0.0
-        return angle_between(self.rotation_xyzw[self.index(start_s)], self.rotation_xyzw[self.index(end_s)])
+        first, last = (self.rotation_xyzw[self.index(second)] for second in (start_s, end_s))
+        return float(angle_of(multiplied(first * INVERSE, last)))
 
     def extent_mm(self, start_s: float, end_s: float) -> float:
         """Return the longest side of the box around the path between two times in s."""
@@ -149,6 +150,18 @@ def smoothed_tip(seconds: Floats, tip_mm: Floats, window_s: float) -> tuple[Floa
     window = window / window.sum()
     smooth = sum(weight * rested[at : at + count] for at, weight in enumerate(window.tolist()))
     return grid_s, np.asarray(smooth)
+
+
+def lengths_along(points: Floats) -> Floats:
+    """Return the length of a path from its first point to each of its points.
+
+    Args:
+        points: The path, shape (T, 3), in any unit.
+
+    Returns:
+        Lengths in that unit, shape (T,), from 0.
+    """
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
 
 
 def spans_of(seconds: Floats, on: Flags) -> list[Span]:
@@ -264,19 +277,6 @@ def same_signs(rotation_xyzw: Floats) -> Floats:
     """
     flips = np.where((rotation_xyzw[1:] * rotation_xyzw[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(rotation_xyzw * np.append(1.0, np.cumprod(flips))[:, None])
-
-
-def angle_between(one_xyzw: Floats, other_xyzw: Floats) -> float:
-    """Return the angle between two orientations.
-
-    Args:
-        one_xyzw: Unit quaternion, shape (4,).
-        other_xyzw: Unit quaternion, shape (4,).
-
-    Returns:
-        The angle in rad, 0 to pi.
-    """
-    return float(angle_of(multiplied(one_xyzw * INVERSE, other_xyzw)))
 
 
 def _rate(grid_s: Floats, values: Floats) -> Floats:

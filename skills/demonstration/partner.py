@@ -39,7 +39,6 @@ from skills.fields import Point, Quaternion, computed_field, schema
 from skills.kinematics import INSTRUMENTS, matrix_of
 
 NEAR_MM = 40.0  # between tips that hold one needle: 26 mm along its arc, 17 mm across, plus the width of the jaws
-STEADY_MM, STEADY_RAD = 3.0, 0.05  # a base that moved more in the other frame has no single pose
 APART_S = 0.1  # a pose further away in time is not used
 
 
@@ -174,7 +173,7 @@ def in_base(partner: Partner, base: BaseFrame, bases: Sequence[BaseFrame]) -> Pa
         bases: Result of `base_frames` for the recording.
     """
     position, rotation = _seen_from(base, np.array(partner.position_mm), np.array(partner.rotation_xyzw))
-    base_mm, base_xyzw = _other_base(base, partner.arm, bases) if _is_steady(base) else (None, None)
+    base_mm, base_xyzw = _other_base(base, partner.arm, bases) if base.is_steady else (None, None)
     position_mm, rotation_xyzw = xyz(position), xyzw(rotation)
     return replace(partner, position_mm=position_mm, rotation_xyzw=rotation_xyzw, base_mm=base_mm, base_xyzw=base_xyzw)
 
@@ -198,7 +197,7 @@ def pose_at(recording: Recording, motion: Motion, second: float) -> int | None:
 def _base_of(motion: Motion, bases: Sequence[BaseFrame]) -> BaseFrame | None:
     """Return the base of a local motion's arm in the frame of its other poses; None unless it stood still there."""
     for one in bases:
-        if (one.arm, one.local_frame) == (motion.arm, motion.frame) and motion.is_local and _is_steady(one):
+        if (one.arm, one.local_frame) == (motion.arm, motion.frame) and motion.is_local and one.is_steady:
             return one
     return None
 
@@ -206,14 +205,10 @@ def _base_of(motion: Motion, bases: Sequence[BaseFrame]) -> BaseFrame | None:
 def _other_base(base: BaseFrame, arm: str, bases: Sequence[BaseFrame]) -> tuple[Point, Quaternion] | tuple[None, None]:
     """Return the pose of another arm's base in this arm's base; None unless both stood still in one common frame."""
     for one in bases:
-        if (one.arm, one.frame) == (arm, base.frame) and _is_steady(one):
+        if (one.arm, one.frame) == (arm, base.frame) and one.is_steady:
             position, rotation = _seen_from(base, np.array(one.position_mm), np.array(one.rotation_xyzw))
             return xyz(position), xyzw(rotation)
     return None, None
-
-
-def _is_steady(base: BaseFrame) -> bool:
-    return base.spread_mm <= STEADY_MM and base.spread_rad <= STEADY_RAD
 
 
 def _instrument_of(recording: Recording, arm: str) -> str | None:
@@ -344,6 +339,8 @@ def find_transfers(
 
 @dataclass(frozen=True)
 class _Overlap:
+    """A hold of the giver's jaw in which the taker's closes and which it outlasts; times in s since `origin_ns`."""
+
     giver: str
     taker: str
     held_s: float
@@ -355,6 +352,15 @@ class _Overlap:
 
 @dataclass(frozen=True)
 class _Observed:
+    """The motion of both tips around an overlap.
+
+    Attributes:
+        overlap: The overlap.
+        slip_mm: Change of the distance between the tips while both jaws are closed.
+        parted_mm: Greatest distance of the giver's tip from where it was at the release, in the time after it.
+        apart_mm: Mean distance between the tips while both jaws are closed; None if the arms share no frame.
+    """
+
     overlap: _Overlap
     freed_s: float
     slip_mm: float
@@ -363,9 +369,11 @@ class _Observed:
 
     @property
     def pair(self) -> tuple[str, ...]:
+        """The names of both arms, sorted: the usual distance is that of a pair, whichever of them gives."""
         return tuple(sorted((self.overlap.giver, self.overlap.taker)))
 
     def judged(self, usual_mm: float | None) -> NeedleTransfer:
+        """Return it as a transfer with its confidence, given the usual distance between the tips of this pair."""
         one = self.overlap
         deviation_mm = 0.0 if self.apart_mm is None or usual_mm is None else abs(self.apart_mm - usual_mm)
         holds_s = min(one.taken_s - one.held_s, LONG_S), min(one.keeps_s - one.released_s, LONG_S)

@@ -22,7 +22,8 @@ LEAST_HZ = 5.0  # a tip at 100 mm/s moves by 20 mm between two samples
 MOST_HZ = 100_000.0
 USUAL_MM_S = (7.0, 120.0)
 USUAL_HZ = 250.0  # of columns that record a motion above USUAL_MM_S: pictures have at most 60 Hz, the dVRK has 100
-WINDOW_NS, FURTHEST_NS = 50_000_000, 10**18
+WINDOW_NS = 50_000_000
+FURTHEST_NS = 10**18  # 31 years: no window is longer, so that a stamp and a window together are an int64
 WINDOWS = 1000  # evenly spaced, however long the recording is
 
 

@@ -158,6 +158,7 @@ def pieces_of(demo: Demo) -> list[slice]:
 
 
 def _movement(demo: Demo, piece: slice) -> Movement:
+    """Return the smoothed motion of some of the samples."""
     rotation = None if demo.rotation_xyzw is None else demo.rotation_xyzw[piece]
     return movement_of(demo.stamps_s[piece], demo.tip_mm[piece], rotation)
 
@@ -199,13 +200,14 @@ def _orientation_change(demo: Demo, until_s: float) -> float | None:
 
 
 def _advice(report: MotionReport, *, has_jaw: bool) -> tuple[str, ...]:
+    """Return a sentence for each measure that is out of range."""
     said = []
     if report.idle_share > IDLE_SHARE:
         said.append(f"The needle rests for {report.idle_share:.0%} of the time: cut away the idle start and end.")
     if report.clutch_presses > 0:
         times = describe_count(report.clutch_presses)
         said.append(f"You clutched {times}: set up the masters so that the hand-off fits into one sweep.")
-    if (seconds := (report.undriven_s or 0.0) - (report.clutched_s or 0.0)) > 0:
+    if (seconds := report.undriven_s - report.clutched_s) > 0:
         said.append(f"Teleoperation did not follow for {seconds:.1f} s: engage the masters before the hand-off.")
     if report.longest_gap_s > max(0.1, 5.0 / max(report.rate_hz, 1e-9)):
         said.append(f"The recorder lost {report.longest_gap_s:.2f} s: the path is interpolated there, so record again.")

@@ -39,11 +39,13 @@ from skills.kinematics import matrix_of, quaternion_of
 from skills.quaternions import INVERSE, angle_of, best_turn, multiplied, turned, unit
 from skills.remedies import did_you_mean
 
+NS_PER_S = 1_000_000_000
 BASES_LIMIT = 64  # ours: pairs of motions of one arm in two frames; a dVRK's recording has one or two per arm
 PAIR_NS = 2_000_000  # ours: between two poses so near in time a tip at 100 mm/s moves by 0.2 mm
 PAIRS_LEAST = 10  # ours: from fewer pairs it cannot be concluded that a base stood still
-IDENTIFIED_LIMIT = 16  # ours: pairs of joints and poses that are compared, each for 0.1 s; a dVRK has two per arm
+IDENTIFIED_LIMIT = 16  # ours: pairs of joints and poses that are compared, 0.1 s each; a dVRK has two per arm
 JOINT_GAP_NS = 50_000_000  # ours: joints further apart in time are not interpolated
+STEADY_MM, STEADY_RAD = 3.0, 0.05  # ours: a base that moved more in the other frame has no single pose
 WIDE_MM = 2.0  # ours: a rotation cannot be fitted to tips that move less than this in a second direction
 
 
@@ -71,6 +73,11 @@ class BaseFrame:
     spread_mm: float
     spread_rad: float
 
+    @property
+    def is_steady(self) -> bool:
+        """Whether the base stood still in `frame`."""
+        return self.spread_mm <= STEADY_MM and self.spread_rad <= STEADY_RAD
+
     def is_of(self, motion: Motion) -> bool:
         """Return whether it is the base of a motion's arm in the frame of that motion."""
         return (self.arm, self.frame) == (motion.arm, motion.frame)
@@ -97,7 +104,7 @@ def identified_arms(
 
     Args:
         motions: Poses; those that were computed from joints are left out.
-        joints: Measured joints. Of more than `IDENTIFIED_LIMIT` pairs of an arm only the first are compared.
+        joints: Measured joints. Of more than `IDENTIFIED_LIMIT` pairs, of all arms together, the first are compared.
         tools: Arm and its stated instrument.
         timed: Whether the stamps are times that were recorded, so that speeds can be computed from them.
     """
@@ -469,6 +476,7 @@ def preference(motion: Motion) -> tuple[int, str]:
 
 
 def _listed(topics: tuple[Topic, ...]) -> str:
+    """Return a sentence with the first 20 topics; nothing if there are none."""
     if not topics:
         return ""
     return " It has " + ", ".join(f"{topic.name} ({topic.type})" for topic in topics[:20]) + "."

@@ -177,6 +177,12 @@ def format_of(file: BinaryIO) -> FileFormat:
 
 
 def _format_of_text(head: bytes) -> FileFormat:
+    """Return the format of a file with this head that has the first bytes of none.
+
+    Raises:
+        UnknownFormat: It is no text of a known format.
+        UnreadableRecording: It is a pointer of Git LFS.
+    """
     for magic, name in _OTHERS:
         if head.startswith(magic):
             remedies = [Remedy(Action.CUT_EPISODE)] if magic == _PARQUET else []
@@ -204,6 +210,7 @@ def _format_of_text(head: bytes) -> FileFormat:
 
 
 def _in_frame(recording: Recording, frame: str | None) -> Recording:
+    """Return a recording unless the caller names a frame in which none of its motions is."""
     frames = sorted({motion.frame for motion in recording.motions})
     if frame is not None and frame not in frames:
         raise MixedFrames(f"No motion is in the frame {frame!r}; the frames are {', '.join(frames)}.", frames=frames)

@@ -127,6 +127,7 @@ class Archive:
             yield out
 
     def _copy(self, name: str, out: IO[bytes]) -> None:
+        """Unpack a member, counting its bytes against its claimed size and the limits."""
         info = self._infos[name]
         limit = min(self._left, max(FREE_BYTES, RATIO * info.compress_size))
         if info.file_size > limit:
@@ -199,6 +200,7 @@ def _check_end(file: BinaryIO) -> None:
 
 
 def _check_members(infos: list[zipfile.ZipInfo]) -> None:
+    """Refuse too many members, two of one name, encryption, unknown compression, and archives in the archive."""
     if len(infos) > MEMBERS:
         raise UnreadableRecording(f"The zip archive has more than {MEMBERS} members; send one bag at a time.")
     seen: set[str] = set()

@@ -11,7 +11,6 @@ dataset (see `lerobot`), or one JIGSAWS trial.
 
 The bag is in one folder, anywhere in the archive. The messages of a bag in several files are merged by their log time.
 If there is a `metadata.yaml`, it must name exactly these files and count exactly these messages.
-
 """
 
 import re
@@ -111,9 +110,9 @@ def read_metadata(text: str) -> Metadata:
         files = tuple(PurePosixPath(name).name for name in bag["relative_file_paths"])
         for topic in bag["topics_with_message_count"]:
             name, messages = topic["topic_metadata"]["name"], topic["message_count"]
-            if not (name and messages.isdecimal()):
+            if not (name and messages.isdecimal() and len(messages) <= 18):  # as many digits as 64 bits hold
                 raise ValueError(messages)
-            counts[name] += int(messages[:18])  # as many digits as 64 bits hold
+            counts[name] += int(messages)
         if not files:
             raise ValueError("no files")
         mode = bag.get("compression_mode", "")
@@ -210,6 +209,7 @@ def read_one(file: BinaryIO) -> Recording:
 
 
 def _read_bag(archive: Archive, names: list[str], bag: list[str]) -> Recording:
+    """Read the files of the one bag in an archive, with the tags beside them; raises as `read_zip`."""
     folders = sorted({str(PurePosixPath(name).parent) for name in bag})
     suffixes = sorted({suffix_of(name) for name in bag})
     if len(folders) > 1 or len(suffixes) > 1 or len(bag) > FILES:
@@ -259,6 +259,7 @@ def _read_mcaps(archive: Archive, names: list[str]) -> Recording:
 
 
 def _each(archive: Archive, names: Iterable[str]) -> Iterator[BinaryIO]:
+    """Yield the files one after the other, each unpacked while it is used."""
     for name in names:
         with _plain(archive, name) as file:
             yield file
@@ -266,6 +267,7 @@ def _each(archive: Archive, names: Iterable[str]) -> Iterator[BinaryIO]:
 
 @contextmanager
 def _plain(archive: Archive, name: str) -> Iterator[BinaryIO]:
+    """Unpack a file, and decompress it if rosbag2 compressed it as a whole."""
     with archive.unpacked(name) as file:
         if not suffix_of(name).endswith(".zstd"):
             yield file
@@ -289,6 +291,7 @@ def _tags(archive: Archive, names: list[str]) -> Iterator[tuple[str, str]]:
 
 
 def _read_trial(archive: Archive, names: list[str]) -> Recording:
+    """Read the one JIGSAWS trial among texts, with its transcription and ratings; raises as `read_zip`."""
     if len(names) > TEXTS:
         raise UnreadableRecording(
             f"The archive has {len(names)} text files; send one trial with its transcription at a time.",

@@ -35,7 +35,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from skills.arrays import Ints
-from skills.demonstration.recording import Motion, Recording, Signal
+from skills.demonstration.recording import NS_PER_S, Motion, Recording, Signal
 from skills.errors import BadRecording
 from skills.formats import topics
 from skills.formats.archive import pack
@@ -44,7 +44,6 @@ from skills.formats.mcap.reader import NOTES
 from skills.formats.topics import BOOL, FLOAT64, JOINT_STATE, JOY, POSE, STRING
 from skills.verification.timeline import ArmTrack, Timeline
 
-_NANO = 1_000_000_000
 _MESSAGES = files("skills.formats") / "messages"  # ROS's own definitions, with those of nested messages
 DEFINITIONS = {
     kind: (_MESSAGES / f"{kind.rpartition('/')[2]}.msg").read_text()
@@ -141,7 +140,7 @@ class _Body:
 
     def header(self, stamp_ns: int, frame: str) -> Self:
         """Append a std_msgs/Header."""
-        return self.put("i", stamp_ns // _NANO).put("I", stamp_ns % _NANO).text(frame)
+        return self.put("i", stamp_ns // NS_PER_S).put("I", stamp_ns % NS_PER_S).text(frame)
 
 
 @dataclass
@@ -235,6 +234,7 @@ def messages_of(recording: Recording) -> list[Message]:
 
 
 def _messages(recording: Recording) -> Iterator[Message]:
+    """Yield the messages of a recording, stream after stream."""
     for motion in recording.motions:
         yield from _poses(motion, "local/measured_cp")
     for motion in recording.masters:
@@ -268,6 +268,7 @@ def _messages(recording: Recording) -> Iterator[Message]:
 
 
 def _poses(motion: Motion, topic: str) -> Iterator[Message]:
+    """Yield the poses of a motion, on its own topic or on that of its arm."""
     if motion.rotation_xyzw is None:
         raise BadRecording(f"{motion.topic} has no orientation, and a pose message needs one; add it before writing.")
     topic = _named(motion.topic, f"/{motion.arm}/{topic}")
@@ -277,6 +278,7 @@ def _poses(motion: Motion, topic: str) -> Iterator[Message]:
 
 
 def _pedals(recording: Recording) -> Iterator[tuple[str, Signal]]:
+    """Yield the topics and states of the pedals, the clutch among them."""
     yield from recording.pedals
     clutch = recording.clutch
     if clutch is not None:
@@ -286,6 +288,7 @@ def _pedals(recording: Recording) -> Iterator[tuple[str, Signal]]:
 
 
 def _named(topic: str, otherwise: str) -> str:
+    """Return a name that is a topic, or else another topic."""
     return topic if topic.startswith("/") else otherwise
 
 
@@ -329,6 +332,7 @@ def timeline_mcap(timeline: Timeline, source: str) -> bytes:
 
 
 def _shown(timeline: Timeline) -> Iterator[Message]:
+    """Yield the messages of a timeline, stream after stream."""
     rows = np.arange(0, timeline.rows, max(1, int(timeline.rate_hz / MOST_HZ)))
     stamps_ns = np.round(rows / timeline.rate_hz * 1e9).astype(np.int64).tolist()
     for arm in timeline.arms:
@@ -343,6 +347,7 @@ def _shown(timeline: Timeline) -> Iterator[Message]:
 
 
 def _of_arm(arm: ArmTrack, rows: Ints, stamps_ns: list[int]) -> Iterator[Message]:
+    """Yield the messages of an arm at some rows of its columns; those without a recorded number are left out."""
     topic = _topic(f"arm {arm.arm}")
     turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1)) if arm.rotation_xyzw is None else arm.rotation_xyzw[rows]
     poses = np.hstack([arm.tip_mm[rows] / 1000.0, turns])
@@ -359,14 +364,17 @@ def _of_arm(arm: ArmTrack, rows: Ints, stamps_ns: list[int]) -> Iterator[Message
 
 
 def _numbers(topic: str, stamps_ns: list[int], values: NDArray[np.float32]) -> Iterator[Message]:
+    """Yield the numbers that are not NaN."""
     for stamp_ns, value in zip(stamps_ns, values.tolist(), strict=True):
         if value == value:
             yield number(topic, stamp_ns, value)
 
 
 def _ns(timeline: Timeline, second: float) -> int:
+    """Return the nanoseconds since the first row; 0 for earlier times."""
     return max(0, round((second - timeline.start_s) * 1e9))
 
 
 def _topic(name: str) -> str:
+    """Return the topic of a trace or an arm."""
     return f"{PREFIX}/{re.sub(r'[^A-Za-z0-9]+', '_', name).strip('_')}"

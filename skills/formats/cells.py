@@ -114,6 +114,7 @@ def csv_rows(text: TextIO, *, first_line: int = 1, separator: str = ",") -> "Rea
 
 
 def _lines(text: TextIO, number: int) -> Iterator[str]:
+    """Yield the lines of a table; `number` is that of the first one. Raises as `csv_rows`."""
     while line := text.readline(LINE_CHARACTERS + 1):
         if len(line) > LINE_CHARACTERS:
             raise UnreadableRecording(
@@ -232,11 +233,12 @@ def read_numbers(text: TextIO, layout: TableLayout) -> ParsedNumbers:
         _check_digits(layout.names, layout.time[0], row)
     if layout.time is not None:
         column, unit = layout.time
-        _check_early(layout.names[column], unit, numbers.groups[list(layout.groups).index([column])][:, 0])
+        _check_years(layout.names[column], unit, numbers.groups[list(layout.groups).index([column])][:, 0])
     return numbers
 
 
 def _mostly_repeated(stamps_ns: Ints) -> bool:
+    """Return whether more than half of the stamps repeat the one before."""
     return bool(2 * np.count_nonzero(stamps_ns[1:] == stamps_ns[:-1]) > len(stamps_ns))
 
 
@@ -371,7 +373,7 @@ def _stamps(texts: Any, ns_per_unit: int) -> Ints:
     except (ArrowInvalid, _NotPlain):
         return np.fromiter((_exact_ns(text, ns_per_unit) for text in texts.to_pylist()), np.int64, len(texts))
     words: Ints = np.frombuffer(decimals.buffers()[1], np.int64).reshape(-1, 2)[: len(texts)]
-    return np.minimum(words[:, 0], _LATEST_S * 1_000_000_000)  # `_check_early` refuses those that need both words
+    return np.minimum(words[:, 0], _LATEST_S * 1_000_000_000)  # `_check_years` refuses those that need both words
 
 
 def _any_numbers(text: TextIO, layout: TableLayout) -> ParsedNumbers:
@@ -438,6 +440,7 @@ def _with_points(names: Sequence[str], used: Sequence[int], cells: list[str], li
 
 
 def _no_number(names: Sequence[str], used: Sequence[int], cells: list[str], line: int) -> UnreadableRecording:
+    """Return the error for the first cell of a row that is no number."""
     k, cell = next((k, cell) for k, cell in zip(used, cells, strict=True) if not is_number(cell))
     where = f"Row {line}, column {names[k]}"
     if is_number(cell.replace(",", ".", 1)):
@@ -451,6 +454,7 @@ def _no_number(names: Sequence[str], used: Sequence[int], cells: list[str], line
 
 
 def _check_finite(layout: TableLayout, found: Sequence[Floats]) -> None:
+    """Refuse NaN and infinity, naming the first row that has one."""
     wrong = list[tuple[int, int]]()
     for group, values in zip(layout.groups, found, strict=True):
         if not (finite := np.isfinite(values)).all():
@@ -474,8 +478,8 @@ def _since_1970(date: re.Match[str], ns_per_unit: int) -> str:
     return f"{Decimal(since_ns) / ns_per_unit:f}"
 
 
-def _check_digits(names: Sequence[str], column: int, cells: list[str], line: int = _FIRST_ROW) -> None:
-    """Refuse times that lost their digits, such as 1.76E+09, because they would repeat.
+def _check_digits(names: Sequence[str], column: int, cells: list[str]) -> None:
+    """Refuse times of the first row that lost their digits, such as 1.76E+09, because they would repeat.
 
     Raises:
         UnreadableRecording: A time of ten digits or more has fewer, and an exponent.
@@ -484,13 +488,13 @@ def _check_digits(names: Sequence[str], column: int, cells: list[str], line: int
     mantissa, mark, exponent = cell.lower().partition("e")
     if mark and is_number(cell) and abs(float(exponent)) > sum(letter.isdigit() for letter in mantissa) - 1 >= 0:
         raise UnreadableRecording(
-            f"Row {line}, column {names[column]}: {cell[:40]!r} has lost its last digits, in a spreadsheet or as a "
-            "float. Export the times with all digits, as whole numbers or as text."
+            f"Row {_FIRST_ROW}, column {names[column]}: {cell[:40]!r} has lost its last digits, in a spreadsheet or as "
+            "a float. Export the times with all digits, as whole numbers or as text."
         )
 
 
 def _exact_ns(cell: str, ns_per_unit: int) -> int:
-    """Convert a time to whole nanoseconds exactly; 0 for one that `_check_early` or `_check_finite` refuses."""
+    """Convert a time to whole nanoseconds exactly; 0 for one that `_check_years` or `_check_finite` refuses."""
     whole, _, part = cell.partition(".")
     if whole.isdecimal() and len(whole) < 20 and (not part or part.isdecimal()) and len(part) <= _PLACES[ns_per_unit]:
         stamp_ns = int(whole + part.ljust(_PLACES[ns_per_unit], "0"))  # ten times as fast as a Decimal
@@ -502,7 +506,8 @@ def _exact_ns(cell: str, ns_per_unit: int) -> int:
     return min(stamp_ns, _LATEST_S * 1_000_000_000)
 
 
-def _check_early(name: str, unit: str, times: Floats) -> None:
+def _check_years(name: str, unit: str, times: Floats) -> None:
+    """Refuse times after the year 2096: they are in a smaller unit than the one that was named."""
     late = np.abs(times) >= _LATEST_S * (1_000_000_000 // NS_PER[unit])
     if late.any():
         row = int(np.argmax(late))

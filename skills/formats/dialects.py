@@ -61,6 +61,7 @@ def _closes(header: str, row: str, separator: str) -> bool:
 
 
 def _rewrite(text: io.TextIOWrapper, out: BinaryIO, *, is_marked: bool, closing: str) -> None:
+    """Write the lines of a text in UTF-8, without `sep=`, the header's `#` and closing separators."""
     while line := text.readline(LINE_CHARACTERS + 1):
         if is_marked:
             is_marked = False

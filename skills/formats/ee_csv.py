@@ -58,7 +58,6 @@ from skills.kinematics import INSERTION
 from skills.remedies import Action, Remedy
 
 TIME = "timestamp"
-STEADY_MM, STEADY_RAD = 3.0, 0.05  # as of `skills.demonstration.partner`: a base that moves more has no single pose
 _FIRST = re.compile(r"psm\d+_(pose\.position\.x|(measured_)?js\[0\])")
 _USED = re.compile(
     r"(?P<arm>psm\d+)_((?P<pose>pose|rcm_pose|sp)\.(?P<part>position\.[xyz]|orientation\.[xyzw])"
@@ -192,6 +191,7 @@ def _doubled(name: str) -> BadColumns:
 def _columns(
     names: Sequence[str], groups: Mapping[Quantity, Indices], time: int | None
 ) -> tuple[recording.Column, ...]:
+    """Return all columns of the header, each with what it was read as."""
     meant = {} if time is None else {time: ("t", "ns")}
     for (arm, kind), columns in groups.items():
         for index, part in zip(columns, _PARTS.get(kind, _POSE), strict=True):
@@ -201,6 +201,7 @@ def _columns(
 
 
 def _check_whole(times: Floats) -> None:
+    """Refuse times that are not whole nanoseconds."""
     if (times != np.rint(times)).any():
         raise BadColumns(
             f"The column {TIME} is not in whole nanoseconds, which this format has; in which unit is it? Name "
@@ -216,6 +217,7 @@ def _recording(
     columns: tuple[recording.Column, ...],
     faults: Mapping[str, str],
 ) -> recording.Recording:
+    """Return the recording of the numbers of each quantity; raises as `read_ee_csv`."""
     motions: list[recording.Motion] = []
     joints: list[recording.Joints] = []
     jaws: list[tuple[str, recording.Signal]] = []
@@ -305,6 +307,6 @@ def _local(arm: str, stamps_ns: Ints, pose: Parts, seen: recording.Motion | None
     if seen is None:
         raise MixedFrames("The arm has no other pose that would show whether it is the tip in the arm's base.")
     bases = recording.base_frames(recording.Recording("csv", "none", (local, replace(seen, frame="other"))))
-    if not bases or bases[0].spread_mm > STEADY_MM or bases[0].spread_rad > STEADY_RAD:
+    if not (bases and bases[0].is_steady):
         raise MixedFrames("No fixed transform leads from it to the arm's other pose, so its frame is not known.")
     return local

@@ -16,7 +16,7 @@ from typing import BinaryIO, TextIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Recording, Topic, recorded_motion
+from skills.demonstration.recording import NS_PER_S, Recording, Topic, recorded_motion
 from skills.errors import BadColumns, MixedFrames, NoUsableTopic, UnreadableRecording
 from skills.formats import topics
 from skills.formats.cells import LINE_CHARACTERS, check_whole, csv_rows, open_text
@@ -82,8 +82,10 @@ def _samples(text: TextIO, parts: tuple[str, str]) -> tuple[Ints, Floats, list[s
     for row in rows:
         try:
             sec, nanosec, frame, *pose = (row[column] for column in columns)
-            stamps.append(int(sec) * 1_000_000_000 + int(nanosec))
+            stamps.append(int(sec) * NS_PER_S + int(nanosec))
             numbers.extend(map(float, pose))
+            if "_" in "".join((sec, nanosec, *pose)) or not 0 <= int(nanosec) < NS_PER_S:
+                raise ValueError(nanosec)  # Python parses 1_000, which no exporter writes
         except (ValueError, IndexError, OverflowError):
             line = rows.line_num + _HEADER_LINE - 1
             raise UnreadableRecording(

@@ -131,10 +131,12 @@ def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def _all(data: memoryview, kind: bytes) -> list[memoryview]:
+    """Return the contents of all boxes of a type in another one."""
     return [content for found, content in _boxes(data) if found == kind]
 
 
 def _one(data: memoryview, *path: bytes) -> memoryview:
+    """Return the contents of the only box of each type along a path."""
     for kind in path:
         found = _all(data, kind)
         if len(found) != 1:
@@ -144,6 +146,7 @@ def _one(data: memoryview, *path: bytes) -> memoryview:
 
 
 def _pictures(moov: memoryview, media_bytes: int) -> Mp4:
+    """Return the pictures of a file from its header."""
     if _all(moov, b"mvex"):
         raise _NotMp4("it is written in fragments")
     tracks = _all(moov, b"trak")
@@ -160,6 +163,7 @@ def _pictures(moov: memoryview, media_bytes: int) -> Mp4:
 
 
 def _check_sizes(stsz: memoryview, frames: int, media_bytes: int) -> None:
+    """Compare the number of frames and their lengths with the times and with the file."""
     each, count = struct.unpack_from(">II", stsz, 4)
     if count != frames:
         raise _NotMp4(f"it has {count} frames, and times of {frames}")
@@ -170,6 +174,7 @@ def _check_sizes(stsz: memoryview, frames: int, media_bytes: int) -> None:
 
 
 def _format(stsd: memoryview) -> tuple[str, int, int]:
+    """Return the codec, the width and the height."""
     (count,) = struct.unpack_from(">I", stsd, 4)
     entries = list(_boxes(stsd[8:]))
     if count != 1 or len(entries) != 1:

@@ -28,7 +28,7 @@ import apsw
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Format, Integrity, Recording, Topic
+from skills.demonstration.recording import NS_PER_S, Format, Integrity, Recording, Topic
 from skills.errors import BackwardStamps, NoUsableTopic, UnreadableRecording
 from skills.formats import topics
 from skills.formats.archive import printable, refusing
@@ -82,6 +82,7 @@ def guard(connection: apsw.Connection) -> None:
 
 
 def _limit_steps(connection: apsw.Connection, steps: int) -> None:
+    """Interrupt all queries of a connection once they have used so many steps together."""
     left = steps
 
     def over() -> bool:
@@ -113,6 +114,7 @@ def _check_objects(connection: apsw.Connection) -> None:
 
 
 def _check_profiles(connection: apsw.Connection) -> None:
+    """Refuse more topics, or longer quality-of-service profiles, than a recorder writes."""
     columns = [column[1] for column in connection.pragma("table_xinfo", "topics") or ()]
     profiles = "total(length(offered_qos_profiles))" if "offered_qos_profiles" in columns else "0"
     ((count, characters),) = connection.execute(f"SELECT count(*), {profiles} FROM topics")  # noqa: S608 - ours
@@ -125,6 +127,7 @@ def _check_profiles(connection: apsw.Connection) -> None:
 
 
 def _foreign(kind: str, name: object) -> UnreadableRecording:
+    """Return the error for an object that rosbag2 does not write."""
     return UnreadableRecording(
         f"The SQLite bag (.db3) has a {kind} {printable(name)!r}, which rosbag2 does not write. {_ADVICE}",
         kind=kind,
@@ -132,6 +135,7 @@ def _foreign(kind: str, name: object) -> UnreadableRecording:
 
 
 def _allowed(action: int, one: str | None, other: str | None, _schema: str | None, _inner: str | None) -> int:
+    """Authorize the statements of rosbags, and deny all others: SQLite's authorizer callback."""
     fine = (
         action == apsw.SQLITE_SELECT
         or (action == apsw.SQLITE_READ and one in TABLES | {"sqlite_master", "sqlite_schema"})
@@ -148,7 +152,6 @@ DB3_MAGIC = b"SQLite format 3\0"
 Suffix = Literal[".bag", ".db3", ".mcap"]
 _FORMATS: dict[Suffix, Format] = {".bag": "rosbag1", ".db3": "rosbag2", ".mcap": "mcap"}
 _NAMES = {".bag": "ROS 1 bag", ".db3": "SQLite bag (.db3)", ".mcap": "MCAP file"}
-_NANO = 1_000_000_000
 
 guard_connections()
 
@@ -295,7 +298,7 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
         for connection, _, data in reader.messages(connections=wanted):
             said: Any = reader.deserialize(data, connection.msgtype)
             place = _PLACES[connection.msgtype](said)
-            stamps.append(int(said.header.stamp.sec) * _NANO + int(said.header.stamp.nanosec))
+            stamps.append(int(said.header.stamp.sec) * NS_PER_S + int(said.header.stamp.nanosec))
             places.append((place.x, place.y, place.z))
     place_mm = 1000.0 * np.array(places, np.float64).reshape(-1, 3)
     seen = np.isfinite(place_mm).all(axis=1)  # a tracker that has lost its marker says NaN
@@ -318,6 +321,7 @@ def ros2_types() -> "Typestore":
 
 @contextmanager
 def _reading(paths: Sequence[Path]) -> "Iterator[AnyReader]":
+    """Open a recording with rosbags; raises `UnreadableRecording` if it cannot."""
     advice = "Copy it again, or convert it with `ros2 bag convert` or `rosbags-convert`."
     what = f"The {_NAMES.get(paths[0].suffix, 'bag')}"
     for path in paths:
@@ -344,6 +348,7 @@ def _check_indexed(head: bytes) -> None:
 
 
 def _convert(reader: "AnyReader", out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
+    """Write the used messages as MCAP, and return all topics; raises as `convert`."""
     here = _topics(reader)
     if not any(topics.arm_of_pose(topic.name, topic.type) for topic in here):
         said = ", ".join(f"{topic.name} ({topic.type})" for topic in here[:20])
@@ -356,6 +361,7 @@ def _convert(reader: "AnyReader", out: IO[bytes], notes: dict[str, str] | None =
 
 
 def _topics(reader: "AnyReader") -> tuple[Topic, ...]:
+    """Return the topics of an open recording, with the numbers of their messages."""
     counts: Counter[tuple[str, str]] = Counter()
     for connection in reader.connections:
         counts[connection.topic, connection.msgtype] += connection.msgcount

@@ -202,6 +202,7 @@ def read_table(file: BinaryIO, reading: ReadingOptions | None = None) -> Recordi
 
 
 def _recording(table: _Table, options: ReadingOptions, columns: tuple[Column, ...]) -> Recording:
+    """Return the recording of the numbers of a table; raises as `read_table`."""
     arm = options.table_arm or DEFAULT_ARM
     joints = None
     if JOINT_NAMES[0] in table.columns:
@@ -439,6 +440,7 @@ def _check_degrees(names: Sequence[str], uses: Mapping[str, _Use], columns: Mapp
 
 
 def _rotation_xyzw(table: _Table) -> Floats | None:
+    """Return the orientations as unit quaternions, (T, 4); None if the table has none."""
     if QUATERNION[0] in table.columns:
         return table.stacked(QUATERNION)
     if RPY[0] in table.columns:

@@ -98,15 +98,18 @@ def _sidecars(documents: Mapping[str, Json]) -> Iterator[tuple[str, list[Any]]]:
 
 
 def _stamps_for(name: str, document: Json, frames: Mapping[str, list[Any]]) -> list[Any]:
+    """Return the times of the frames that tags count in; empty if there is no sidecar."""
     video = PurePosixPath(name).stem.removesuffix("_tags")
     return frames.get(str(document.get("video_file"))) or frames.get(video) or []
 
 
 def _is_named(stage: Any) -> bool:
+    """Return whether a stage has a name that is a text."""
     return isinstance(stage, dict) and isinstance(stage.get("name"), str)
 
 
 def _label(name: str, stage: Any, stamps: list[Any]) -> Label | None:
+    """Return a stage as a label; None where its start or its end has no time."""
     if not _is_named(stage):
         raise UnreadableRecording(f"{_short(name)} has a stage without a name.")
     start, end = (_moment_ns(stage.get(edge), stamps) for edge in ("start", "end"))

@@ -129,6 +129,7 @@ def counted(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
 
 
 def _of_pose(topic: str) -> Meaning | None:
+    """Return the meaning of a topic of poses."""
     name = topic.rsplit("/", 1)[-1]
     if name in _SETPOINTS:
         return _about(TopicKind.SETPOINT, _named(_PSM, topic))
@@ -138,6 +139,7 @@ def _of_pose(topic: str) -> Meaning | None:
 
 
 def _of_joints(topic: str) -> Meaning | None:
+    """Return the meaning of a topic of measured joint states."""
     psm, mtm = _named(_PSM, topic), _named(_MTM, topic)
     part = topic.split("/")[-2]
     if part == "jaw":

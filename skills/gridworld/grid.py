@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Floats, Ints, freeze, frozen, xyz
+from skills.arrays import Flags, Floats, Ints, freeze, frozen, xyz
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.quality import describe_count
 from skills.errors import BadPath, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
@@ -68,7 +68,7 @@ class GridWorld:
         """Return the nearest cell of each point in mm, both of shape (..., 3); it may lie outside the grid."""
         return np.floor((np.asarray(tip_mm, float) - self.origin_mm) / self.cell_mm + 0.5).astype(np.int64)
 
-    def holds(self, cells: ArrayLike) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def holds(self, cells: ArrayLike) -> Flags:
         """Return for each cell, (..., 3), whether it is in the grid."""
         cells = np.asarray(cells)
         inside = (cells >= 0) & (cells < self.shape)
@@ -470,6 +470,7 @@ def _calming(
 
 
 def _about_the_papers_grid(outside: float, path: GridPath) -> tuple[str, ...]:
+    """Return the advice that the samples are not all in the paper's grid."""
     size = " x ".join(f"{count}" for count in path.grid.shape)
     share = "all" if outside == 1 else f"{outside:.0%}"
     return (

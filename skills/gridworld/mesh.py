@@ -52,9 +52,8 @@ def tissue_of_mesh(
     plane = Tissue.plane((0.0, 0.0, 0.0), normal)
     up, along = unit(np.array([normal, plane.along]))
     axes = np.stack([along, np.cross(up, along)])
-    places = np.column_stack([product(points, axes.T) / step_mm, product(points, up)])[
-        corners
-    ]  # (m, 3, 3): steps, steps, mm
+    of_points = np.column_stack([product(points, axes.T) / step_mm, product(points, up)])  # (n, 3): steps, steps, mm
+    places = of_points[corners]  # (m, 3, 3)
     flat = places.reshape(-1, 3)
     first = np.ceil(flat[:, :2].min(axis=0) - ROUNDING)
     shape = np.floor(flat[:, :2].max(axis=0) + ROUNDING) - first + 1

@@ -26,7 +26,7 @@ class RewardLevels:
     goal: float = 10.0
     visited: float = 1.0
     other: float = 0.0
-    off_grid: float = -1.0  # for a move off the grid, which stays where it is
+    off_grid: float = -1.0
 
     def __post_init__(self) -> None:
         for name, level in asdict(self).items():

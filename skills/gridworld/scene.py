@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import product
-from skills.arrays import Flags, Floats, xyz
+from skills.arrays import Flags, Floats, Ints, xyz
 from skills.errors import BadSettings
 from skills.fields import Point, schema
 from skills.quaternions import unit
@@ -176,10 +176,8 @@ class Tissue:
         heights, normal = np.array(self.heights_mm), unit(np.array(self.normal))
         steep = self.steep
         # Only the part of a line that is not far above the highest point of the tissue can be near it.
-        top, up_a, up_b = (
-            heights.max() + within_mm * steep,
-            *(product(end - self.at_mm, normal) for end in (a_mm, b_mm)),
-        )
+        top = heights.max() + within_mm * steep
+        up_a, up_b = (product(end - self.at_mm, normal) for end in (a_mm, b_mm))
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = np.clip((top - up_a) / (up_b - up_a), 0, 1)
         first, last = np.where(up_a > top, crossing, 0.0), np.where(up_b > top, crossing, 1.0)
@@ -325,7 +323,7 @@ def _tuple(value: Any) -> Any:
     return tuple(map(_tuple, value)) if isinstance(value, list | tuple) else value
 
 
-def _between(places: Floats, n: int) -> tuple[np.ndarray[Any, Any], Floats]:
+def _between(places: Floats, n: int) -> tuple[Ints, Floats]:
     """Return the index of the map's point at or before each place, and the share of the way to the next one."""
     inside = places.clip(0, n - 1)
     index = np.floor(np.nan_to_num(inside)).astype(np.int64)  # the share of NaN stays NaN

@@ -37,6 +37,8 @@ class SlipModel:
         if not 0 <= self.probability <= 1:
             raise BadSettings("A slip must be a probability, from 0 to 1.", slip=self.probability)
         freeze(self, drawn=(len(MOVES),))
+        if not ((self.drawn >= 0).all() and abs(self.drawn.sum() - 1) < 1e-9):
+            raise BadSettings("The probabilities of the drawn moves must be 0 or more, with the sum 1.")
 
     @property
     def intended(self) -> float:

@@ -98,6 +98,7 @@ def warp(distance: Any, cost: Any) -> None:
 
 
 def _walk_back(cost: Floats) -> Ints:
+    """Return the pairs of indices, (K, 2), along the cheapest way through a table that `warp` filled."""
     i, j = cost.shape[0] - 1, cost.shape[1] - 1
     pairs = [(i - 1, j - 1)]
     while (i, j) != (1, 1):

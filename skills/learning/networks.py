@@ -173,9 +173,8 @@ class Space:
         Returns:
             The lengths s and the distances u of the module's docstring, both of shape (N,), in cells.
         """
-        cells = (
-            np.asarray(positions_mm, float)[:, None] - self.path.tip_mm[:-1]
-        ) / self.path.grid.cell_mm  # (N, R - 1, 3)
+        from_mm = np.asarray(positions_mm, float)[:, None] - self.path.tip_mm[:-1]  # (N, R - 1, 3)
+        cells = from_mm / self.path.grid.cell_mm
         share = np.clip((cells * self._legs).sum(axis=-1) / self._lengths**2, 0.0, 1.0)
         off = np.linalg.norm(cells - share[..., None] * self._legs, axis=-1)
         # Rounded, so that distances that differ by a rounding error count as equal.
@@ -205,14 +204,17 @@ class Space:
 
     @cached_property
     def _legs(self) -> Floats:
+        """The moves of the demonstration, (R - 1, 3), in cells."""
         return np.asarray(np.diff(self.path.cells, axis=0), np.float64)
 
     @cached_property
     def _lengths(self) -> Floats:
+        """The lengths of these moves, (R - 1,), in cells."""
         return np.asarray(np.linalg.norm(self._legs, axis=1))
 
     @cached_property
     def _before(self) -> Floats:
+        """The length of the demonstration before each of these moves, (R - 1,), in cells."""
         return np.concatenate(([0.0], np.cumsum(self._lengths)[:-1]))
 
 
@@ -298,6 +300,7 @@ Deep = DQN | InSpace
 
 
 def _check(learner: Deep) -> None:
+    """Refuse settings outside of their ranges."""
     ranges = {"steps": 10**9, "width": 1024, "batch": 65_536, "steps_per_update": 1_000_000, "worlds": 64}
     for name, most in ranges.items():
         if not 1 <= getattr(learner, name) <= most:

@@ -45,9 +45,7 @@ _POWERS = np.cumprod([1.0, *[0.9459594689067654] * 144])  # of exp(-1 / 18)
 WARP_SMOOTHING = _POWERS[np.square(np.arange(-12, 13))] / _POWERS[np.square(np.arange(-12, 13))].sum()
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length; three printed decimals pass
 LIKE_FLOOR = 1e-6  # of squared distances between situations; several demonstrations may share one
-SHARES = np.linspace(
-    1.0, 0.0, 21
-)  # of the demonstrations' turn, from which one is chosen; of equally good ones the first
+SHARES = np.linspace(1.0, 0.0, 21)  # of the demonstrations' turn; of equally good ones the first is chosen
 TRIED = 5  # every fifth phase is enough to choose it
 FAR_RAD = 0.9 * np.pi  # at half a turn from the shortest turn, the side on which the mean lies changes suddenly
 

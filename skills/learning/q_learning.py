@@ -139,6 +139,7 @@ class Training:
 
 
 def _check(learner: QLearner) -> None:
+    """Refuse settings outside of their ranges."""
     for name in ("alpha", "gamma"):
         if not 0 < getattr(learner, name) <= 1:
             raise BadSettings(f"{name} must lie in (0, 1].", **{name: getattr(learner, name)})

@@ -36,6 +36,8 @@ from skills.arrays import Flags, Floats
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import Partner, PartnerMotion
 from skills.errors import BadSettings
+from skills.gridworld.grid import MOVES
+from skills.gridworld.hazards import STAY
 from skills.gridworld.scene import Scene
 from skills.learning.pose_step import ROUNDING, Hands, advance
 from skills.learning.pose_style import PosePath, learn_pose_style
@@ -219,7 +221,7 @@ def _moves(path: PosePath, ahead: int) -> tuple[float, float]:
     """Return the largest distance and angle between two poses of a path that are some phases apart."""
     turns = path.rotation_xyzw
     moved = np.linalg.norm(path.tip_mm[ahead:] - path.tip_mm[:-ahead], axis=1)
-    turned = angle_of(multiplied(turns[:-ahead] * INVERSE, turns[ahead:]))
+    turned = _angles(turns[:-ahead], turns[ahead:])
     return float(moved.max(initial=0.0)), float(turned.max(initial=0.0))
 
 
@@ -233,7 +235,7 @@ def _bulge(path: PosePath, ahead: int) -> tuple[float, float]:
             chord = (1 - share) * path.tip_mm[:-window] + share * path.tip_mm[window:]
             off = np.linalg.norm(path.tip_mm[inside : inside - window] - chord, axis=1)
             way = between(turns[:-window], turns[window:], np.full(len(off), share))
-            angle = angle_of(multiplied(way * INVERSE, turns[inside : inside - window]))
+            angle = _angles(way, turns[inside : inside - window])
             furthest_mm, furthest_rad = max(furthest_mm, off.max()), max(furthest_rad, angle.max())
     return float(furthest_mm), float(furthest_rad)
 
@@ -247,7 +249,7 @@ def _try_update(path: PosePath, limits: TubeLimits, update: Update) -> tuple[int
     Returns:
         The number of updates checked, and the assumptions that do not hold.
     """
-    sides = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)])
+    sides = np.delete(MOVES, STAY, axis=0)
     sides = sides / np.linalg.norm(sides, axis=1, keepdims=True)
     far_mm, far_rad = (
         _deciding(step, disturbance, start)

@@ -21,7 +21,7 @@ reaches it from outside its circle.
 """
 
 from dataclasses import dataclass
-from math import ceil, pi, radians
+from math import pi, radians
 from typing import Literal, get_args
 
 import numpy as np
@@ -119,39 +119,6 @@ class OtherArm:
     def __post_init__(self) -> None:
         freeze(self, base_mm=(3,), base_xyzw=(4,), joints=(None, 6), jaw_rad=(len(self.joints),))
         matrix_of(self.base_xyzw[None])
-
-
-@dataclass(frozen=True, eq=False)
-class Jaws:
-    """The angles of both jaws while both arms stand and the needle changes hands, shape (2 * ticks,) each.
-
-    First the one that takes the needle closes, then the one that gave it opens; each by a minimum-jerk move.
-    """
-
-    takes_rad: Floats
-    gives_rad: Floats
-
-    @classmethod
-    def between(cls, taker_rad: tuple[float, float], giver_rad: tuple[float, float], rate_hz: float) -> "Jaws":
-        """Return the angles after each tick.
-
-        Args:
-            taker_rad: The jaw that takes the needle, before and after.
-            giver_rad: The jaw that gives it.
-            rate_hz: Samples per second.
-        """
-        ticks = ceil(JAW_S * rate_hz)
-        u = np.arange(1, ticks + 1) / ticks
-        done = u * u * u * (10 - 15 * u + 6 * u * u)
-        (open_rad, held_rad), (holds_rad, lets_rad) = taker_rad, giver_rad
-        still = np.ones(ticks)
-        closing, opening = open_rad + (held_rad - open_rad) * done, holds_rad + (lets_rad - holds_rad) * done
-        closing[-1], opening[-1] = held_rad, lets_rad  # without round-off
-        return cls(np.concatenate((closing, held_rad * still)), np.concatenate((holds_rad * still, opening)))
-
-    def __len__(self) -> int:
-        """The number of ticks."""
-        return len(self.takes_rad)
 
 
 def needle_tips_mm() -> Floats:
@@ -295,6 +262,7 @@ def _across(a_m: Floats, present: Floats, toward: ArrayLike | None) -> Floats:
 
 
 def _toward(present: Floats, n_star: Floats, a_star: Floats, sign: int) -> Realignment:
+    """Return the realignment to one of the two rotations with this approach."""
     target = np.stack([n_star, np.cross(a_star, n_star), a_star], axis=1)
     angle, axis = _turn_between(present, target)
     return Realignment(target, angle, n_star if angle == 0 else axis, sign)
@@ -311,5 +279,6 @@ def _turn_between(start: Floats, target: Floats) -> tuple[float, Floats]:
 
 
 def _unit(vector: Floats) -> Floats | None:
+    """Return a vector with length 1; None if it has none."""
     length = float(np.linalg.norm(vector, axis=-1))
     return vector / length if length > 1e-12 else None

@@ -2,6 +2,7 @@
 
     polyline --followed--> one position per tick
     start and end poses of the arms --move--> poses per tick
+    angles of two jaws before and after --Jaws.between--> angles per tick
 
 The spline of A1 goes through every point of a polyline, rests at both ends, and stays near the straight moves between
 the points. It is a clamped cubic spline whose parameter is the length along the moves, in whole ticks, so that each
@@ -26,7 +27,7 @@ from skills.arithmetic import arccos
 from skills.arrays import Floats, Ints, freeze
 from skills.errors import BadSpeed
 from skills.kinematics import angle_between
-from skills.planning.handoff import turn
+from skills.planning.handoff import JAW_S, turn
 
 MAX_DEVIATION_MM = 1.25  # a quarter of the paper's cell
 PIECES_MM = (10.0, 5.0, 2.5, 1.25)
@@ -207,6 +208,15 @@ class Pace:
         return replace(self, speed_mm_s=speed_mm_s, turn_rad_s=turn_rad_s, tempo=tempo)
 
 
+def minimum_jerk(u: Floats) -> Floats:
+    """Return the part of a move that is done at parts of its time.
+
+    Args:
+        u: Parts of the time, 0 to 1.
+    """
+    return u * u * u * (10 - 15 * u + 6 * u * u)
+
+
 def move(start: Arms, end: Arms, pace: Pace, least_ticks: int = 0) -> tuple[Poses, ...]:
     """Move the arms from one set of poses to another, by the minimum-jerk law.
 
@@ -224,9 +234,40 @@ def move(start: Arms, end: Arms, pace: Pace, least_ticks: int = 0) -> tuple[Pose
         BadSpeed: More than `MAX_SAMPLES` ticks.
     """
     ticks = max(least_ticks, *(_ticks_of_moves(a, b, pace) for a, b in zip(start, end, strict=True)))
-    u = np.arange(ticks + 1) / max(1, ticks)
-    done = u * u * u * (10 - 15 * u + 6 * u * u)
+    done = minimum_jerk(np.arange(ticks + 1) / max(1, ticks))
     return tuple(_between(a, b, done) for a, b in zip(start, end, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Jaws:
+    """The angles of both jaws while both arms stand and the needle changes hands, shape (2 * ticks,) each.
+
+    First the one that takes the needle closes, then the one that gave it opens; each by a minimum-jerk move.
+    """
+
+    takes_rad: Floats
+    gives_rad: Floats
+
+    @classmethod
+    def between(cls, taker_rad: tuple[float, float], giver_rad: tuple[float, float], rate_hz: float) -> "Jaws":
+        """Return the angles after each tick.
+
+        Args:
+            taker_rad: The jaw that takes the needle, before and after.
+            giver_rad: The jaw that gives it.
+            rate_hz: Samples per second.
+        """
+        ticks = ceil(JAW_S * rate_hz)
+        done = minimum_jerk(np.arange(1, ticks + 1) / ticks)
+        (open_rad, held_rad), (holds_rad, lets_rad) = taker_rad, giver_rad
+        still = np.ones(ticks)
+        closing, opening = open_rad + (held_rad - open_rad) * done, holds_rad + (lets_rad - holds_rad) * done
+        closing[-1], opening[-1] = held_rad, lets_rad  # without round-off
+        return cls(np.concatenate((closing, held_rad * still)), np.concatenate((holds_rad * still, opening)))
+
+    def __len__(self) -> int:
+        """The number of ticks."""
+        return len(self.takes_rad)
 
 
 def held(pose: Pose, ticks: int) -> Poses:
@@ -260,6 +301,7 @@ def _ticks_of_moves(start: Pose, end: Pose, pace: Pace) -> int:
 
 
 def _between(start: Pose, end: Pose, done: Floats) -> Poses:
+    """Return poses on the way from one to another, at parts of it that are done, (T,)."""
     tip = start.tip_mm + done[:, None] * (end.tip_mm - start.tip_mm)
     rotation = turn(start.rotation, end.rotation, done)
     if len(done) > 1:  # without round-off, because the next part begins exactly at the end pose

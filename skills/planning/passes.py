@@ -44,7 +44,7 @@ from skills.planning.path_fit import Hand
 from skills.quaternions import unit
 
 STAND_OFF_MM = 30.0  # ours: the needle's circle, 16.6 mm across, plus a finger of 10.2 mm, plus a little more
-_HINGE_REVERSED = np.diag([-1.0, -1.0, 1.0])
+HINGE_REVERSED = np.diag([-1.0, -1.0, 1.0])  # times a rotation [n o a]: jaws are symmetric about their approach
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +183,7 @@ def other_arm(poses: Poses, ticks: Ticks, psm_m: PsmM) -> OtherArm:
     base_mm, base_xyzw = np.array(psm_m.base_mm), np.array(psm_m.base_xyzw)
     base = matrix_of(base_xyzw[None])[0]
     seen = Poses(product(poses.tip_mm - base_mm, base), product(base.T, poses.rotation))
-    reversed_ = Poses(seen.tip_mm, product(seen.rotation, _HINGE_REVERSED))
+    reversed_ = Poses(seen.tip_mm, product(seen.rotation, HINGE_REVERSED))
     # Both are solved over the complete motion, because the jaws must not change sides on the way.
     either = [solve(one, ticks, psm_m.instrument, "PSM_M") for one in (seen, reversed_)]
     joints = min(either, key=lambda joints: float(np.abs(joints[:, ROLL]).max()))
@@ -306,6 +306,7 @@ def _arms(psm_a: Pose, psm_m: Pose | None) -> Arms:
 
 
 def _meeting(one: PassPath, number: int, psm_m: PsmM) -> Meeting:
+    """Return the poses of PSM_M around the hand-off of a pass; raises `BadPlan` for a pass without A2."""
     if one.target_rotation is None:
         raise BadPlan(f"Pass {number} has no A2, so PSM_M cannot take the needle.", **{"pass": number})
     return meeting(Pose(one.tip_mm[-1], one.target_rotation), psm_m, one.taking)

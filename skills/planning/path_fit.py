@@ -1,6 +1,6 @@
 """Smooth paths along the raw demonstration, inside a rollout's cells, and the hand along them.
 
-    Demo, GridPath --trace--> Trace;   Rollout, Trace, start --fit_to_demo--> FittedPath
+    Demo, GridPath --trace--> SmoothedDemo;   Rollout, SmoothedDemo, start --fit_to_demo--> FittedPath
 
 The grid rounds a demonstration to the centres of its cells, half a cell away (h / 2 in 3-D) on average. The recording
 has the surgeon's actual place in each cell. All of this is ours; the paper drives from centre to centre.
@@ -55,7 +55,7 @@ import numpy as np
 from skills.arithmetic import product
 from skills.arrays import Flags, Floats, Ints, freeze, interpolated
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.movement import same_signs, smoothed_tip
+from skills.demonstration.movement import lengths_along, same_signs, smoothed_tip
 from skills.errors import BadPlan
 from skills.gridworld.grid import GridPath
 from skills.kinematics import instrument_of, matrix_of, quaternion_of
@@ -177,7 +177,7 @@ def fit_to_demo(followed: Rollout, demonstrated: SmoothedDemo, start_mm: Floats 
     """
     assert followed.finished and np.array_equal(followed.path.states, demonstrated.path.states)
     guide, visits, clock_s = _guide(followed, demonstrated, start_mm)
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1)))
+    along = lengths_along(guide)
     if along[-1] == 0:
         return FittedPath(guide[:1], visits[:1], clock_s[[0, -1]], np.zeros(2))
     grid, cell_mm = followed.path.grid, followed.path.grid.cell_mm
@@ -254,7 +254,7 @@ def _nearest(tip_mm: Floats, of_visit: Flags, place_mm: Floats) -> int:
 
 def _blended(tip_mm: Floats, place_mm: Floats, over_mm: float) -> Floats:
     """Return a path, (M, 3), that begins at a place and joins the original path over a length."""
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    along = lengths_along(tip_mm)
     share = np.minimum(along / over_mm, 1.0)[:, None]
     blended: Floats = tip_mm + (place_mm - tip_mm[0]) * (1 - share * share * (3 - 2 * share))
     return blended
@@ -302,7 +302,10 @@ def _touching(at: Floats, visits: Ints, cells: Ints) -> tuple[Floats, Ints]:
 
 
 def _smoothest(wanted: Floats, low: Floats, high: Floats, stiffness: float) -> Floats:
-    """Solve the minimisation above for points, (K, 3), within boxes, by Nesterov's accelerated projected gradient."""
+    """Solve the minimisation of the module's docstring for points within boxes, all of shape (K, 3).
+
+    By Nesterov's accelerated projected gradient.
+    """
     rate = 1 / (1 + 16 * stiffness)  # 1 over the largest curvature of the objective; the smallest is 1
     push = (1 - np.sqrt(rate)) / (1 + np.sqrt(rate))
     x = ahead = wanted.clip(low, high)
@@ -375,18 +378,13 @@ class Hand:
             Positions of the tip, mm, shape (count, 3); rotations [n o a], shape (count, 3, 3), or None; and angles of
             the jaw, shape (count,), or None.
         """
-        turned = None
-        if self.rotation_xyzw is not None:
-            quaternions = self._between(same_signs(self.rotation_xyzw), count)
-            turned = matrix_of(quaternions)
-        jaw = self.jaw_rad
-        return (
-            self._between(self.tip_mm, count),
-            turned,
-            None if jaw is None else self._between(jaw, count).clip(jaw.min(), jaw.max()),
-        )
+        seen, jaw = self.rotation_xyzw, self.jaw_rad
+        turned = None if seen is None else matrix_of(self._between(same_signs(seen), count))
+        opened = None if jaw is None else self._between(jaw, count).clip(jaw.min(), jaw.max())
+        return self._between(self.tip_mm, count), turned, opened
 
     def _between(self, values: Floats, count: int) -> Floats:
+        """Return values, (M, ...), at evenly spaced times, (count, ...)."""
         from scipy.interpolate import CubicSpline  # here, because clients read plans without it
 
         # A cubic spline, because a step of the speed at every sample would be an acceleration without bound.
@@ -413,22 +411,26 @@ def hand_along(demo: Demo, fitted: FittedPath, *, turning: bool) -> Hand:
     times = times[(times >= clock_s[0]) & (times <= clock_s[-1])]
     recorded_s = np.maximum(times, joins_s)  # during the approach the jaw is as where the path joins
     points = np.arange(len(fitted.tip_mm), dtype=np.float64)
-    grid_s, tip_mm = _calm(times, interpolated(np.interp(times, clock_s, places), points, fitted.tip_mm), TREMOR_S)
+    grid_s, tip_mm = _calm(times, interpolated(np.interp(times, clock_s, places), points, fitted.tip_mm))
     turned, opened = None, None
     if turning and demo.rotation_xyzw is not None:
-        _, turned = _calm(times, interpolated(recorded_s, demo.stamps_s, same_signs(demo.rotation_xyzw)), TREMOR_S)
+        _, turned = _calm(times, interpolated(recorded_s, demo.stamps_s, same_signs(demo.rotation_xyzw)))
         turned = unit(turned)
     if (jaw := jaw_within(demo)) is not None:
-        opened = _calm(times, np.interp(recorded_s, demo.stamps_s, jaw)[:, None], TREMOR_S)[1][:, 0]
+        opened = _calm(times, np.interp(recorded_s, demo.stamps_s, jaw)[:, None])[1][:, 0]
     off_mm = _off_mm(tip_mm, fitted.tip_mm, np.interp(grid_s, clock_s, places))
     return Hand((grid_s - grid_s[0]).round(9), tip_mm, off_mm, turned, opened)
 
 
-def _calm(seconds: Floats, values: Floats, window_s: float) -> tuple[Floats, Floats]:
-    """Average values, (T, N), of a hand that rests before and after, at even times; first and last are exact."""
+def _calm(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Average values, (T, N), of a hand that rests before and after, over `TREMOR_S`; first and last are exact.
+
+    Returns:
+        Even times, (M,), from half a window before the first to half a window after the last, and the means, (M, N).
+    """
     half_s = TREMOR_S / 2
     rested_s = np.concatenate(([seconds[0] - half_s], seconds, [seconds[-1] + half_s]))
-    grid_s, calm = smoothed_tip(rested_s, np.concatenate((values[:1], values, values[-1:])), window_s)
+    grid_s, calm = smoothed_tip(rested_s, np.concatenate((values[:1], values, values[-1:])), TREMOR_S)
     calm[[0, -1]] = values[[0, -1]]  # without the window's round-off
     return grid_s, calm.round(9)  # so that every machine computes the same bytes
 
@@ -438,7 +440,7 @@ def _clock(fitted: FittedPath) -> tuple[float, Floats, Floats]:
 
     The approach has the mean speed of what is followed after it.
     """
-    way_mm = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(fitted.tip_mm, axis=0), axis=1)))
+    way_mm = lengths_along(fitted.tip_mm)
     joins_s = float(fitted.clock_s[0])
     joined = int(np.flatnonzero(fitted.clock_s == joins_s)[-1])  # the approach is all at one time
     clock_s, places = fitted.clock_s[joined:], fitted.places[joined:]
@@ -534,5 +536,5 @@ def styled(followed: Demo, demos: Sequence[Demo]) -> Demo:
 
 def _shares(tip_mm: Floats) -> Floats:
     """Return the part of a path's length up to each point, (T,), from 0 to 1."""
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    along = lengths_along(tip_mm)
     return np.asarray(along / along[-1])

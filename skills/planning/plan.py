@@ -7,10 +7,9 @@ One learnt policy serves many passes (Sec. IV, Fig. 7).
 A pass moves the complete grid world so that the policy's *goal* lies at the suture point, turned about it if the point
 has a rotation. In the moved grid the policy is rolled out from the pass's start. The result is a path in the arm's
 frame: through the centres of its cells, as in the paper, or, if the demonstration is given, fitted to the recording
-within the same cells (`skills.planning.path_fit`), with the surgeon's orientation, jaw and tempo along it
-(`skills.planning.path_fit`). What was demonstrated at the policy's goal is then done at the suture point: the hand's
-last sample lies there, somewhere in the cell of the goal. Between passes the surgeon inserts and grasps the needle by
-hand (M1, M2).
+within the same cells, with the surgeon's orientation, jaw and tempo along it (`skills.planning.path_fit`). What was
+demonstrated at the policy's goal is then done at the suture point: the hand's last sample lies there, somewhere in the
+cell of the goal. Between passes the surgeon inserts and grasps the needle by hand (M1, M2).
 
 The orientation turns with the pass. It is held as at the first sample where that is requested, and the plan then states
 its *departure* from the recorded one. A2 ends in the recorded hand-off, the poses of both arms moved with the pass, if
@@ -69,8 +68,6 @@ Orientation = Literal["recorded", "demonstrated", "assumed tool-down"]
 Turning = Literal["recorded", "constant"]
 A2Target = Literal["recorded", "paper"]
 PathKind = Literal["fitted", "cell centres"]
-
-
 STEP_MM = 0.1  # greatest distance between samples: that of a plan at the default 20 mm/s and 200 Hz
 
 
@@ -381,6 +378,12 @@ def _pass(
     jaw: Floats,
     plan: SuturePlan,
 ) -> Pass:
+    """Plan one pass at a suture point.
+
+    Raises:
+        BadPlan: From its start the goal is not reached.
+        OutsideGrid: Its start is too far outside of its grid world.
+    """
     grid = policy.path.grid
     goal = grid.centres_mm(policy.path.goal) if recorded is None else recorded.trace.ends_mm[1]
     turned = kinematics.matrix_of(np.array([point.rotation_xyzw]))[0]
@@ -554,6 +557,7 @@ def _at_its_own_place(policy: Policy, demo: Demo) -> SuturePlan:
     """Plan one pass at the demonstrated place, along the fitted path if one can be fitted."""
 
     def pass_along(recorded: Demo | None) -> SuturePlan:
+        """Return the plan of one pass, fitted to a recording or through the centres of the cells."""
         goal_mm = policy.path.tip_mm[-1] if recorded is None else ends_of(recorded, policy.path)[1]
         x, y, z = goal_mm.tolist()
         return stack(

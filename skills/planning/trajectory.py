@@ -44,7 +44,7 @@ from skills.errors import BadPlan, BadSpeed, NoMotion
 from skills.fields import Count, schema
 from skills.kinematics import DEFAULT_INSTRUMENT, angle_between, forward, instrument_of, matrix_of, quaternion_of
 from skills.planning import motion_laws
-from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, Jaws, OtherArm, PsmM
+from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, OtherArm, PsmM
 from skills.planning.motion_laws import A1, A2, TRANSFER
 from skills.planning.passes import PassPath, Route, Ticks, lay_out, other_arm, solve
 
@@ -295,6 +295,7 @@ def _peak_mm_s(routes: Sequence[Route]) -> float:
 
 
 def _taking(passes: Sequence[PassPath]) -> motion_laws.Poses | None:
+    """Return the recorded poses of PSM_M at the hand-offs; None if a pass has none."""
     recorded = [one.taking for one in passes if one.taking is not None]
     if len(recorded) < len(passes):
         return None
@@ -368,11 +369,11 @@ def _sample(one: Route, paces: Paces) -> _Sampled:
     if hands and one.handed is not None:
         rate_hz = paces[A2].rate_hz
         jaw = np.full(len(along), JAW_CLOSED_RAD) if jaw is None else jaw
-        given = Jaws.between((JAW_OPEN_RAD, JAW_CLOSED_RAD), (jaw[-1], _let_go(jaw)), rate_hz)
+        given = motion_laws.Jaws.between((JAW_OPEN_RAD, JAW_CLOSED_RAD), (jaw[-1], _let_go(jaw)), rate_hz)
         parts.append(tuple(motion_laws.held(pose, len(given)) for pose in one.handed))
         first, first_other = np.full(before, jaw[0]), np.full(before, JAW_OPEN_RAD)
         if one.further:
-            taken = Jaws.between((_let_go(jaw), jaw[0]), (JAW_CLOSED_RAD, JAW_OPEN_RAD), rate_hz)
+            taken = motion_laws.Jaws.between((_let_go(jaw), jaw[0]), (JAW_CLOSED_RAD, JAW_OPEN_RAD), rate_hz)
             parts.insert(len(legs), tuple(motion_laws.held(pose, len(taken)) for pose in begin))
             # the last angles are those of A1's first tick
             first = np.concatenate((np.full(before + 1, _let_go(jaw)), taken.takes_rad[:-1]))

@@ -181,6 +181,7 @@ def confine(limits: ProcessLimits, parent: int) -> None:
 
 
 def _limit(which: int, soft: int, hard: int) -> None:
+    """Set a limit of this process, or the most that it is permitted."""
     most = resource.getrlimit(which)[1]
     if most != resource.RLIM_INFINITY:
         soft, hard = min(soft, most), min(hard, most)

@@ -42,6 +42,8 @@ BEGUN, NO_FORK = b"begun", b"no fork"
 
 @dataclass(frozen=True)
 class _Child:
+    """A fork that was begun: its process, and its caller's socket."""
+
     pid: int
     ended: int  # a pidfd: readable once the process has ended
     line: socket.socket
@@ -207,6 +209,7 @@ def _run_child(
     """Close all files but those of this request, apply the limits and the containment, call the function, exit."""
 
     def work() -> None:
+        """Enter the limits and the layers, and call the function."""
         os.setpgid(0, 0)
         os.dup2(given, 0)
         os.dup2(said, 1)

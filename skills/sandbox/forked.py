@@ -63,6 +63,8 @@ class _Dead(Exception):
 
 @dataclass
 class _Server:
+    """A fork server: its process, and our end of its control socket."""
+
     process: subprocess.Popen[bytes]
     control: socket.socket
     folder: str  # for the temporary files of its forks
@@ -223,6 +225,7 @@ class ForkServer:
         raise Busy(_ENDS)
 
     def _running(self) -> _Server:
+        """Return the server, after starting it if there is none; raises `Busy` if that is not possible."""
         with self._lock:
             if not self._open:
                 raise Busy("The service is stopping; try again when it runs again.")
@@ -234,6 +237,7 @@ class ForkServer:
             return self._server
 
     def _replace(self, dead: _Server) -> None:
+        """End a server that does not respond, so that the next call starts another."""
         with self._lock:
             if self._server is dead:  # otherwise another thread has replaced it already
                 self._server = None
@@ -301,6 +305,7 @@ def _failed_reading(error: BaseException | None) -> OSError | None:
 
 
 def _start(modules: tuple[str, ...]) -> _Server:
+    """Start a fork server without waiting for its imports."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.settimeout(START_S)
     folder = tempfile.mkdtemp(prefix="suture-skills-")

@@ -117,6 +117,7 @@ def filter_of(*, threads: bool, programs: bool, pid: int, machine: str | None = 
 
 
 def _numbers(table: str, machine: Machine) -> Iterator[tuple[str, int]]:
+    """Yield the names and numbers of a table's calls on a processor."""
     for entry in table.split(","):
         fields = entry.split()
         if fields[machine.column] != "-":
@@ -124,6 +125,7 @@ def _numbers(table: str, machine: Machine) -> Iterator[tuple[str, int]]:
 
 
 def _case(number: int, then: list[Step]) -> list[Step]:
+    """Return the steps that are taken for one call only."""
     return [(_EQUAL, 0, len(then), number), *then]
 
 
@@ -158,10 +160,12 @@ def _one_of(place: int, values: tuple[int, ...], *, high: bool = False) -> list[
 
 
 def _if(*conditions: list[Step]) -> list[Step]:
+    """Return steps that allow a call if all conditions hold, and refuse it otherwise."""
     return [step for one in conditions for step in (*one, (_RETURN, 0, 0, REFUSE))] + [(_RETURN, 0, 0, ALLOW)]
 
 
 def _unless(condition: list[Step]) -> list[Step]:
+    """Return steps that refuse a call if a condition holds, and allow it otherwise."""
     return [*condition, (_RETURN, 0, 0, ALLOW), (_RETURN, 0, 0, REFUSE)]
 
 

@@ -160,6 +160,7 @@ def _describe(found: Difference, mean_mm: float, apart_mm: Floats, sides: Sides)
 
 
 def _places(found: Difference, sides: Sides) -> Iterator[str]:
+    """Yield a sentence for each third and axis with a large share of the deviation."""
     shares, offsets = found.shares, found.offsets
     states = np.arange(len(found.along)) * len(PARTS) // len(found.along)
     for flat in np.argsort(-shares, axis=None, kind="stable")[:NAMED]:
@@ -300,6 +301,7 @@ def differences(demo: Demo, expert: Sequence[Demo], reference: Demo) -> Differen
 
 
 def _none(demos: int) -> str:
+    """Return the sentence that there is no difference."""
     if demos == 1:
         return (
             "There is no difference beyond what surgeons usually differ from themselves; the expert's own spread is "
@@ -345,6 +347,7 @@ def _by_phase(shape_mm: Floats, onto_mm: Floats) -> Floats:
 
 
 def _at_rest(seconds: Floats, speed_mm_s: Floats) -> Flags:
+    """Return for each sample whether the tip rests for `REST_S` or longer, shape (N,)."""
     resting = np.zeros(len(seconds), bool)
     for start, end in spans_of(seconds, speed_mm_s < REST_MM_S):
         if end - start >= REST_S:
@@ -482,6 +485,7 @@ def _speed(theirs: Sequence[Traced], where: Region) -> float:
 
 
 def _words(kind: int, amount: float, expert: float, speed_mm_s: float) -> str:
+    """Return a difference in words; `amount` and `expert` as in `NamedDifference`."""
     name = KINDS[kind].name
     if name == "wrist":
         return (

@@ -158,7 +158,7 @@ SIDES = ("instruments", "masters")
 
 @dataclass(frozen=True, eq=False)
 class TrialFigures:
-    """The figures of a trial in the order of `KINDS`, as they are modelled.
+    """The figures of a trial in the order of `TRIAL_KINDS`, as they are modelled.
 
     Attributes:
         values: Of the instruments, and of the masters if two were recorded; shape (S, F), S of 1 or 2 `SIDES`.
@@ -229,6 +229,7 @@ def _measured(side: list[tuple[Motion, Signal]]) -> tuple[Floats, Floats]:
 
 
 def _arm(motion: Motion, jaw: Signal, start_ns: int, end_ns: int) -> _Arm:
+    """Return one arm between two stamps, on the grid."""
     inside = (motion.stamps_ns >= start_ns) & (motion.stamps_ns <= end_ns)
     assert motion.rotation_xyzw is not None
     seconds = (motion.stamps_ns[inside] - start_ns) / 1e9
@@ -259,10 +260,9 @@ def _opened(jaw: Signal, start_ns: int, seconds: Floats) -> Ints:
 def _figures(arms: list[_Arm], first: float, last: float) -> Floats:
     """Return the figures between two shares of the time, averaged over the arms: shape (F,)."""
     shared = list(_of_both(arms, first, last))
-    kinds = TRIAL_KINDS
-    each = [[kind.modelled(value) for kind, value in zip(kinds, (*_of_arm(arm, first, last), *shared), strict=True)]
-            for arm in arms]  # fmt: skip
-    return np.asarray(np.mean(each, axis=0))
+    each = [(*_of_arm(arm, first, last), *shared) for arm in arms]
+    modelled = [[kind.modelled(one) for kind, one in zip(TRIAL_KINDS, values, strict=True)] for values in each]
+    return np.asarray(np.mean(modelled, axis=0))
 
 
 def _part(count: int, first: float, last: float) -> slice:
@@ -270,7 +270,7 @@ def _part(count: int, first: float, last: float) -> slice:
 
 
 def _of_arm(arm: _Arm, first: float, last: float) -> Iterator[float]:
-    """Yield the figures of one arm, in the order of `KINDS`."""
+    """Yield the figures of one arm, the first ones of `TRIAL_KINDS` in their order."""
     movement = arm.movement
     part = _part(len(movement.seconds), first, last)
     speed, turning = movement.speed_mm_s[part], movement.turning_rad_s[part]
@@ -298,7 +298,7 @@ def _of_arm(arm: _Arm, first: float, last: float) -> Iterator[float]:
 
 
 def _of_both(arms: list[_Arm], first: float, last: float) -> Iterator[float]:
-    """Yield the figures of both arms of a side together."""
+    """Yield the figures of both arms of a side together, the last ones of `TRIAL_KINDS` in their order."""
     one, other = (arm.movement for arm in arms)
     part = _part(len(one.seconds), first, last)
     speeds = np.stack([one.speed_mm_s, np.interp(one.seconds, other.seconds, other.speed_mm_s)])[:, part]

@@ -167,6 +167,7 @@ def _terms(model: SkillModel, task: int, values: Floats, thirds: Floats) -> Iter
 
 
 def _describe_quality(name: str, judged: TaskValidation) -> str:
+    """Return the quality of the model on a task in a sentence."""
     low, high = judged.model.rho_interval
     return (
         f"Calibrated on {judged.trials} rated trials of {name} by {judged.surgeons} surgeons. For a surgeon left "
@@ -176,11 +177,13 @@ def _describe_quality(name: str, judged: TaskValidation) -> str:
 
 
 def _describe_terms(terms: Sequence[Term]) -> str:
+    """Return the largest terms in a sentence."""
     most = ", ".join(f"{term.label} {term.points:+.1f}" for term in terms[:NAMED])
     return f"From the mean of these trials, the rating moves most by: {most} points."
 
 
 def _describe_thirds(terms: Sequence[Term]) -> str:
+    """Return the sums of the terms in each third in words."""
     sums = [sum(term.thirds[third] for term in terms) for third in range(len(THIRD_NAMES))]
     worst = int(np.argmin(sums))
     cause = min(terms, key=lambda term: term.thirds[worst])
@@ -193,6 +196,7 @@ def _describe_thirds(terms: Sequence[Term]) -> str:
 
 
 def _outside(model: SkillModel, task: int, values: Floats) -> Iterator[str]:
+    """Yield a sentence for each figure outside the range of the calibration."""
     for name, value, low, high in zip(model.figures, values, model.lowest[task], model.highest[task], strict=True):
         if not low <= value <= high:
             kind = TRIAL_KIND_OF[name]

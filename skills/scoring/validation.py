@@ -154,6 +154,7 @@ def validate(
     permuted_rhos, permuted_rights = _permuted(cohort, np.random.default_rng([seed, 1]), permutations, progress)
 
     def judged(rhos: Floats, drawn: Floats, rows: Ints | None = None) -> dict[str, Judged]:
+        """Return the quality of each series; with the accuracy of levels if the trials of a task are given."""
         found = {name: _judged(*of_one) for name, *of_one in zip(series, rhos, drawn, strict=True)}
         if rows is None:
             return found
@@ -255,6 +256,7 @@ def _resampled(surgeons: Ints, rng: np.random.Generator) -> Iterator[Ints]:
 
 
 def _judged(rho: float, drawn: Floats) -> Judged:
+    """Return a rank correlation with its interval, from bootstrap draws, (B,)."""
     low, high = np.quantile(drawn, (0.025, 0.975)).tolist()
     return Judged(float(rho), (low, high))
 
@@ -262,6 +264,7 @@ def _judged(rho: float, drawn: Floats) -> Judged:
 def _validation(
     trials: int, surgeons: int, judged: dict[str, Judged], chance: Chance, drawn: Mapping[str, Floats]
 ) -> TaskValidation:
+    """Return the quality of the model and its rivals together, with the interval of the difference between them."""
     more = drawn["model"] - np.max([drawn[name] for name in DURATIONS], axis=0)
     low, high = np.quantile(more, (0.025, 0.975)).tolist()
     return TaskValidation(
@@ -277,6 +280,7 @@ def _validation(
 
 
 def _p(permuted: Floats, ours: float) -> float:
+    """Return the p-value of our figure among permuted ones, itself counted as one of them."""
     return float(1 + (permuted >= ours).sum()) / (1 + len(permuted))
 
 

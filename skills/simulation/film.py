@@ -203,6 +203,7 @@ def _camera(asked: FilmRequest) -> pictures.Camera:
 
 
 def _draw_path(sheet: pictures.Sheet, asked: FilmRequest, now: int) -> None:
+    """Draw the tip's path of the present pass and those near it: pale where it is still to come."""
     motion, drawn = asked.trajectory, asked.drawn
     near = np.abs(motion.pass_index[drawn] - motion.pass_index[now]) <= _NEAR
     for group in np.unique(asked.groups[drawn[near]]).tolist():

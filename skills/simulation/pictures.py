@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from skills.arrays import Flags, Floats, Ints
+from skills.demonstration.movement import lengths_along
 from skills.kinematics import JOINTS, UNITS, instrument_of, matrix_of
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
@@ -121,11 +122,11 @@ class Sheet:
             fill = (*colour, round(255 * alpha))
             self._pen.line(where[begin : end + 1], fill=fill, width=round(width * self._camera.scale), joint="curve")
 
-    def dots(self, places: Floats, colour: Colour, radius: float = 2.6, strength: float = 1.0) -> None:
-        """Draw dots, pale behind surfaces."""
+    def dots(self, places: Floats, colour: Colour) -> None:
+        """Draw dots at places, shape (K, 3), pale behind surfaces."""
         pixels, hidden = self._project(places)
         for pixel, pale in zip(pixels, hidden.tolist(), strict=True):
-            self._dot(pixel, radius, (*colour, round(255 * strength * (0.35 if pale else 1.0))))
+            self._dot(pixel, 2.6, (*colour, round(255 * (0.35 if pale else 1.0))))
 
     def label(self, place: Floats, colour: Colour, text: str, size: float = 10.0) -> None:
         """Draw a short text on a disc with a white rim, in front of everything."""
@@ -193,15 +194,15 @@ def colour_of(number: int) -> Colour:
     return PASS_COLOURS[number % len(PASS_COLOURS)]
 
 
-def thinned(path: Floats, most: int = 400) -> Floats:
-    """Return at most so many points of a path, its ends among them."""
-    kept = np.unique(np.linspace(0, len(path) - 1, min(len(path), most)).round().astype(int))
+def thinned(path: Floats) -> Floats:
+    """Return at most 400 points of a path, shape (K, 3), its ends among them."""
+    kept = np.unique(np.linspace(0, len(path) - 1, min(len(path), 400)).round().astype(int))
     return np.asarray(path[kept])
 
 
 def stepping_stones(path: Floats) -> Floats:
     """Return a point of a path every 5 mm of its length."""
-    walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    walked = lengths_along(path)
     at = np.searchsorted(walked, np.arange(0.0, walked[-1] + 1e-9, _DOT_EVERY_M))
     return np.asarray(path[np.unique(np.minimum(at, len(path) - 1))])
 
@@ -341,14 +342,11 @@ def _outline(begin: Floats, end: Floats, radius: float) -> Floats:
 def _between_axes(one: tuple[Floats, Floats, float], other: tuple[Floats, Floats, float]) -> tuple[Floats, Floats]:
     """Return the nearest points of two capsules' surfaces, as exactly as a line is drawn."""
     share = np.linspace(0.0, 1.0, 201)[:, None]
-    (p, q), (radius, other_radius) = (
-        (begin + share * (end - begin) for begin, end, _ in (one, other)),
-        (one[2], other[2]),
-    )
+    p, q = (begin + share * (end - begin) for begin, end, _ in (one, other))
     apart = np.linalg.norm(p[:, None] - q, axis=2)
     i, j = np.unravel_index(int(apart.argmin()), apart.shape)
     way = (q[j] - p[i]) / max(float(apart[i, j]), 1e-9)
-    return p[i] + radius * way, q[j] - other_radius * way
+    return p[i] + one[2] * way, q[j] - other[2] * way
 
 
 def png(figure: "Figure") -> bytes:
@@ -359,6 +357,7 @@ def png(figure: "Figure") -> bytes:
 
 
 def _kind(pair: LinkPair) -> str:
+    """Return the label of the line in which a pair's distance is plotted."""
     if pair.other == PAD:
         return f"{pair.body} to the pad"
     return FINGERS_OF_BOTH if pair.may_touch else OTHERS

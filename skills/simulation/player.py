@@ -120,6 +120,7 @@ def default_pad_top(trajectory: Trajectory) -> float:
 
 
 def _lowest_finger(tip_mm: Floats, rotation: Floats) -> float:
+    """Return the least height of the hinge and of the tips of closed jaws, mm."""
     return float((tip_mm[:, 2] + JAW_TIP_MM * np.minimum(rotation[:, 2, 2], 0.0)).min())
 
 

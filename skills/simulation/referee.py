@@ -444,6 +444,7 @@ def _scene(physics: Physics) -> str:
 
 
 def _needle() -> str:
+    """Return the needle's body: round pieces along its arc."""
     turn = np.linspace(-pi / 3, 2 * pi / 3, _SEGMENTS + 1)
     ends = NEEDLE_RADIUS_MM * np.stack([np.sin(turn), 1 - np.cos(turn), np.zeros_like(turn)], axis=1)
     middles = (ends[1:] + ends[:-1]) / 2
@@ -565,6 +566,7 @@ class _Trial:
         return controls
 
     def _through(self, controls: Floats) -> None:
+        """Make a time step with each of some commands."""
         step, model, data, control = self.mujoco.mj_step, self.model, self.data, self.data.ctrl
         for one in controls:
             control[:] = one

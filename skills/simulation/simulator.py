@@ -186,12 +186,6 @@ class Simulator:
 
     # -- measurements and motion --
 
-    def read_joints(self) -> list[float]:
-        """Return PSM_A's joints, rad and mm."""
-        values = [float(state[0]) for state in self.joint_states()]
-        values[INSERTION] /= MM
-        return values
-
     def joint_states(self) -> Any:
         """Return PSM_A's joint states in PyBullet's form: position, speed, reaction, effort of each."""
         return self.bullet.getJointStates(self.arm.number, self.arm.joints)
@@ -260,6 +254,7 @@ class Simulator:
         )
 
     def _in_jaws(self) -> tuple[Floats, Floats]:
+        """Return the needle's pose between PSM_A's jaws, mm and quaternion."""
         tip_mm, quaternion = self.read_tip()
         approach = np.array(self.bullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)[:, 2]
         return tip_mm + HELD_MM * approach, quaternion
@@ -279,6 +274,7 @@ class Simulator:
         scale: float = 1.0,
         wrist_mm: float | None = None,
     ) -> int:
+        """Load a file of the scene, note its digest, and return the number of its body."""
         with _file(name, wrist_mm) as path:
             self.files[name] = sha256(path.read_bytes()).hexdigest()
             return int(
@@ -296,6 +292,7 @@ class Simulator:
     def _load_arm(
         self, position_mm: Floats, quaternion: Floats, tool: InstrumentConstants, opening_rad: float
     ) -> SceneBody:
+        """Load an arm with the wrist offset of its tool, its joint limits, and the opening of each of its fingers."""
         number = self._load("psm.urdf", position_mm, np.asarray(quaternion).tolist(), wrist_mm=tool.wrist_offset_mm)
         found = [self.bullet.getJointInfo(number, index) for index in range(self.bullet.getNumJoints(number))]
         by_joint = {info[1].decode(): int(info[0]) for info in found}

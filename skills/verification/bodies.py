@@ -141,6 +141,7 @@ def radii_of(instrument: str) -> Floats:
 
 
 def _of(instrument: str) -> tuple[ArmCapsule, ...]:
+    """Return the outer bodies of the arm that an instrument is on."""
     return BODIES[instrument_of(instrument).arm.name]
 
 
@@ -168,6 +169,16 @@ def parts_of(joints: Floats, instrument: str) -> Links:
     wrist = (slid - tool.wrist_offset_mm) * shaft
     begin = np.concatenate([ends[0], np.stack([wrist - tool.shaft_mm * shaft, wrist], axis=1)], axis=1)
     return Links(begin, np.concatenate([ends[1], np.stack([wrist, wrist + WRIST_MM * hand], axis=1)], axis=1))
+
+
+def placed(arm: PlannedArm, joints: Floats) -> Links:
+    """Return the parts of an arm of a trajectory with these joints, in PSM_A's base frame.
+
+    Args:
+        arm: The arm, for its instrument and its base.
+        joints: As for `parts_of`.
+    """
+    return parts_of(joints, arm.instrument).seen_from(arm.base, arm.base_mm)
 
 
 def moved_mm(joints: Floats, to: Floats, instrument: str) -> Floats:
@@ -356,7 +367,7 @@ def distances_at(trajectory: Trajectory, at: Ints) -> Floats:
     arms, found = trajectory.arms, []
     radii = [radii_of(arm.instrument) for arm in arms]
     for some in np.array_split(at, 1 + len(at) // _CHUNK):
-        arm, other = (parts_of(one.joints[some], one.instrument).seen_from(one.base, one.base_mm) for one in arms)
+        arm, other = (placed(one, one.joints[some]) for one in arms)
         found.append(between(arm, radii[0], other, radii[1]))
     return np.concatenate(found)
 
@@ -381,6 +392,7 @@ def _named(trajectory: Trajectory, sample: int, part: int, other: int, least_mm:
 
 
 def _all_nearest(trajectory: Trajectory, looks: Ints, seen: Floats) -> tuple[NearestBodies, ...]:
+    """Return the least distance of each pair of parts that came within `CLEARANCE_SEEN_MM`, the least first."""
     known = np.nan_to_num(seen, nan=-np.inf, posinf=np.inf, neginf=-np.inf)
     least, at = known.min(axis=0), known.argmin(axis=0)
     pairs = [(int(i), int(j)) for i, j in np.argwhere(least < CLEARANCE_SEEN_MM)]
@@ -415,7 +427,7 @@ def too_near(
     """
     samples, count = len(arms[0].joints), wanted.shape[1]
     radii, centre = [radii_of(arm.instrument) for arm in arms], arms[1].base_mm
-    planned = [_placed(arm, arm.joints) for arm in arms]
+    planned = [placed(arm, arm.joints) for arm in arms]
     apart = between(planned[0], radii[0], planned[1], radii[1])
     shapes = [one.reshape(count, samples, 6) for one in joints]
     moves = [moved_mm(arm.joints, q, arm.instrument) for arm, q in zip(arms, shapes, strict=True)]
@@ -446,13 +458,9 @@ def too_near(
     return wrong
 
 
-def _placed(arm: PlannedArm, joints: Floats) -> Links:
-    return parts_of(joints, arm.instrument).seen_from(arm.base, arm.base_mm)
-
-
 def _axes(arm: PlannedArm, joints: Floats, rows: Ints, parts: Ints) -> tuple[Floats, Floats]:
     """Return beginning and direction of some parts in some poses, both of shape (K, 3)."""
     used, index = np.unique(rows, return_inverse=True)
-    placed = _placed(arm, joints[used])
-    begin = placed.begin_mm[index, parts]
-    return begin, placed.end_mm[index, parts] - begin
+    of_arm = placed(arm, joints[used])
+    begin = of_arm.begin_mm[index, parts]
+    return begin, of_arm.end_mm[index, parts] - begin

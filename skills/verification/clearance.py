@@ -52,7 +52,7 @@ SHAFT_RADIUS_MM = 4.0
 WRIST_REACH_MM = WRIST_MM + 3.6
 FINGER_REACH_MM = 10.3  # the tip's cap is 10.22 from the hinge
 STANDS = 1e-6  # ours, rad and mm: joints that differ by no more are those of one pose
-RADIUS_MM = 0.33  # of the needle's wire
+RADIUS_MM = 0.33  # of the needle's wire, as in `urdf/needle.urdf`
 # The arc from the place where it is held, two thirds from the tip: x along the needle, y towards the arc's centre.
 _TURN = np.linspace(-pi / 3, 2 * pi / 3, 49)
 ARC_BULGE_MM = NEEDLE_RADIUS_MM * (1 - cos((_TURN[1] - _TURN[0]) / 2))  # of the wire beyond the chord of two points
@@ -390,7 +390,7 @@ def needle_in_psm_a(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
     return place, jaws
 
 
-NEEDLE_THICK_MM = 0.66  # the same file
+NEEDLE_THICK_MM = 2 * RADIUS_MM
 _HALF_WIDTH_RAD = FINGER_RADIUS_MM / NEEDLE_RADIUS_MM  # of the arc, from the middle of the fingers to their side
 
 

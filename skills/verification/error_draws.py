@@ -123,6 +123,7 @@ def draw(seed: int, number: int, variations: int, samples: int, *, suture_point_
 
 
 def _stream(seed: int, error: str, number: int) -> np.random.Generator:
+    """Return the random numbers of one error in one pass."""
     key = (_STREAMS.index(error), number)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
 

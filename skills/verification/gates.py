@@ -269,6 +269,7 @@ def first_failure(
 
 
 def _gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:
+    """Yield the gates of a playback; of several that are broken at one sample, the first is reported."""
     yield _Gate("time since the sample before", "samples", figures.ticks, 1 - 1e-6, at_least=True)
     for arm in figures.arms:
         yield from _joint_gates(arm, limits)
@@ -291,6 +292,7 @@ def _gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits:
 
 
 def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
+    """Yield the gates of one arm's joints."""
     prefix = "" if arm.name == PSM_A else f"{arm.name}'s "
     spare = limits.joint_margin * (arm.tool.upper - arm.tool.lower) - ROUND_OFF
     upper, lower = arm.tool.upper - spare, arm.tool.lower + spare
@@ -307,6 +309,7 @@ def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
 
 
 def _clearance_gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:
+    """Yield the gates of the distances between links."""
     # The pair with the least measured distance comes first, because the first gate listed is reported; NaN before all.
     nearest = np.nan_to_num(playback.clearances_mm, nan=-np.inf).min(axis=0)
     for column in np.argsort(nearest, kind="stable").tolist():

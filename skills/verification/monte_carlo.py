@@ -254,6 +254,7 @@ def spoiled(
 def _spoiled(
     scene: PlannedPass, shift_mm: Floats, displaced: Sequence[Displaced], limits: Limits, wanted: Flags
 ) -> dict[str, Flags]:
+    """Return the faults of some variations, computed at once; as `spoiled`."""
     count, samples = len(shift_mm), len(scene.phase)
     joints = [arm.shifted(shift_mm) for arm in scene.arms]
     # Joints stay as commanded, so these faults are the same under every displacement of the arms.

@@ -11,6 +11,7 @@ from math import ceil, nan
 import numpy as np
 
 from skills.arrays import Flags, Floats, Ints
+from skills.demonstration.movement import lengths_along
 from skills.kinematics import instrument_of, matrix_of
 from skills.learning.policy import rollout
 from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, NEEDLE_RADIUS_MM, TAKEN_MM
@@ -46,7 +47,7 @@ def _off_line_mm(tip_mm: Floats, line: Floats) -> Floats:
     off = np.linalg.norm(tip_mm[:, None] - begin - part[..., None] * along, axis=2)
     nearest = off.min(axis=1)
     near, reached = off <= nearest[:, None] + 0.05, np.append(0.0, np.cumsum(lengths)[:-1]) + part * lengths
-    gone = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    gone = lengths_along(tip_mm)
     # Where the line crosses itself the first place counts at the beginning, and then the last one, so that going on is
     # never taken for going back.
     begun, come = np.where(near, reached, np.inf)[0].min(), np.where(near, reached, -np.inf).max(axis=1)
@@ -138,6 +139,7 @@ class PassComparison:
     # ---- A1 --------------------------------------------------------------------------------------------------------
 
     def _speeds(self) -> None:
+        """Compare the speeds of both tips with the greatest that was asked."""
         for arm in (self.arm, self.other):
             if arm is not None and self.request.demo is not None:
                 speed = np.linalg.norm(np.diff(arm.tip_mm[self.rows], axis=0), axis=1) * self.rate_hz
@@ -230,6 +232,7 @@ class PassComparison:
     # ---- A2 and PSM_M ----------------------------------------------------------------------------------------------
 
     def _a2(self) -> None:
+        """Compare A2: the tip held, the jaw's turn and its end, and PSM_M."""
         request, a2, end = self.request, self.a2, self.stood
         assert request.psm_m is not None
         self.put("tip leaves the hand-off", a2, _far_mm(self.arm.tip_mm[a2], self.place_mm))
@@ -261,6 +264,7 @@ class PassComparison:
         return np.array([max(stands_from(self.motion, int(self.a2[-1])), int(self.a2[0]))])
 
     def _papers_a2(self, turned: Floats) -> None:
+        """Compare the jaw, (3, 3), with the paper's hand-off."""
         end, n = self.stood, turned[:, 0]
         hinge = np.linalg.norm(np.cross(n, self.request.approach)), abs(n @ self.request.approach)
         self.put("A2's hinge off PSM_M's approach", end, np.degrees(np.arctan2(*hinge)))
@@ -280,6 +284,7 @@ class PassComparison:
         return quarter - TAKEN_MM * request.approach, jaws
 
     def _psm_m(self) -> None:
+        """Compare where PSM_M waits, how it comes and goes, and where it takes the needle."""
         other, a1, a2, end = self.other, self.a1, self.a2, self.stood
         assert other is not None and self.request.psm_m is not None
         taken_mm, jaws = self.taking()
@@ -356,6 +361,7 @@ class PassComparison:
     # ---- transfers -------------------------------------------------------------------------------------------------
 
     def _transfer(self) -> None:
+        """Compare the start of the pass and the transfer to where A1 begins."""
         rows = self.transfer
         first = self.rows[:1]
         if self.before is None:
@@ -380,6 +386,7 @@ class PassComparison:
         for arm in (self.arm, self.other):
             if arm is not None:
                 speed, rate = _rates(arm, rows)
+                # 45 degrees per second: the greatest rate of a jaw in A2 and transfers
                 active = np.maximum(active, np.maximum(speed / self.request.speed_mm_s, rate / 45.0))
         allowed_s = STAND_S / 2 + BETWEEN_SHARE * len(rows) / self.rate_hz
         still = active <= STILL * active.max(initial=0.0)
@@ -429,7 +436,7 @@ def _off_cells(places: Floats, cells: Ints, reach: float) -> Floats:
         reach: How far from its centre a cell reaches: half of it, and as far as hysteresis lets a recording leave it.
     """
     limit, number = LIMITS["path off the policy's cells"][1], np.arange(len(cells))
-    moved = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    moved = lengths_along(places)
     _, looked = np.unique((moved / CELL_STEP).astype(np.int64), return_index=True)
     looked = np.union1d(looked, [len(places) - 1])
     off = np.zeros(len(places))

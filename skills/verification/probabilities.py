@@ -181,6 +181,7 @@ def counted(found: list[dict[str, Flags]], errors: ArmErrors) -> EstimateUnder:
 
 
 def _pass(found: dict[str, Flags]) -> PassEstimate:
+    """Count the variations of one pass without a fault, and with each fault."""
     on_the_way, at_the_end = ([found[name] for name in names if name in found] for names in (ON_THE_WAY, AT_THE_END))
     return PassEstimate(
         succeeds=share(np.any(on_the_way + at_the_end, axis=0)),

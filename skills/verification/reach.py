@@ -31,6 +31,7 @@ from skills.errors import BadPlan
 from skills.fields import Figure, Point, Quaternion, schema
 from skills.planning.handoff import HOLDING_RAD, OtherArm
 from skills.planning.motion_laws import Poses
+from skills.planning.passes import HINGE_REVERSED
 from skills.planning.plan import Pass, SuturePlan
 from skills.planning.trajectory import PSM_A, PSM_M, PassPoses, Trajectory, poses_along
 from skills.verification import clearance
@@ -45,7 +46,6 @@ SPARSE = (8, 2, 1)  # distances are computed at every so many poses, then at mor
 LEAP_RAD, LEAP_MM = 0.5, 20.0  # ours: a joint that moves further from one pose to the next goes by another way
 BEYOND = 0.01  # of a joint's range: further beyond its limit than between two samples of a plan
 AT_ONCE = 4000  # poses
-_HINGE_REVERSED = np.diag([-1.0, -1.0, 1.0])
 
 Answer = Literal["yes", "no", "in doubt"]
 
@@ -82,13 +82,12 @@ class ReachPlace:
     needle_mm: Figure
 
 
-def map_reach(plan: SuturePlan, positions_mm: Floats, limits: Limits | None = None) -> list[ReachPlace]:
+def map_reach(plan: SuturePlan, positions_mm: Floats) -> list[ReachPlace]:
     """Return where each pass of a plan could be planned by itself.
 
     Args:
         plan: A plan with one pass for each rotation, all at one suture point.
         positions_mm: Suture points in the arm's frame, shape (P, 3).
-        limits: The limits of the verdict.
 
     Returns:
         The places of the first pass's rotation in the order of the positions, then those of the second, and so on.
@@ -101,7 +100,7 @@ def map_reach(plan: SuturePlan, positions_mm: Floats, limits: Limits | None = No
         raise BadPlan(f"A map must have 1 to {MAX_PLACES} places: positions times rotations.", places=count)
     found: list[ReachPlace] = []
     for one in plan.passes:
-        found += _Moved(plan, one, poses_along(one, plan.psm_m, STEP_MM), positions_mm, limits or Limits()).places()
+        found += _Moved(plan, one, poses_along(one, plan.psm_m, STEP_MM), positions_mm).places()
     return found
 
 
@@ -119,8 +118,8 @@ class _Check:
 class _Moved:
     """One pass at P positions: the joints of both arms in S poses each, and what limits them."""
 
-    def __init__(self, plan: SuturePlan, one: Pass, poses: PassPoses, positions_mm: Floats, limits: Limits) -> None:
-        self.plan, self.one, self.poses, self.positions, self.limits = plan, one, poses, positions_mm, limits
+    def __init__(self, plan: SuturePlan, one: Pass, poses: PassPoses, positions_mm: Floats) -> None:
+        self.plan, self.one, self.poses, self.positions, self.limits = plan, one, poses, positions_mm, Limits()
         by, count = positions_mm - np.array(one.point.position_mm), len(positions_mm)
         self.yes, self.no = np.ones(count, bool), np.zeros(count, bool)
         self.because: list[str | None] = [None] * count
@@ -133,7 +132,7 @@ class _Moved:
             seen = Poses((poses.arms[1].tip_mm - np.array(psm_m.base_mm)) @ base, base.T @ poses.arms[1].rotation)
             either = [
                 self._solved(way, by @ base, PSM_M, psm_m.instrument)
-                for way in (seen, Poses(seen.tip_mm, seen.rotation @ _HINGE_REVERSED))
+                for way in (seen, Poses(seen.tip_mm, seen.rotation @ HINGE_REVERSED))
             ]
             rolls = [np.abs(q[:, :, kinematics.ROLL]).max(axis=1) for q in either]
             self.other = np.where((rolls[0] <= rolls[1])[:, None, None], *either)
@@ -191,6 +190,7 @@ class _Moved:
     # ---- distances -------------------------------------------------------------------------------------------------
 
     def _portions(self, rows: Ints) -> list[Ints]:
+        """Divide positions into parts that are computed at once."""
         most = max(1, AT_ONCE // len(self.poses.phase))
         return [rows[k : k + most] for k in range(0, len(rows), most)]
 
@@ -237,6 +237,7 @@ class _Moved:
         )
 
     def _checks(self, motion: Trajectory, looks: "_Looks") -> Iterator[_Check]:
+        """Yield the checks of distances at some positions and poses."""
         scene, arms = self.plan.scene, motion.arms
         if len(arms) == 2:
             ways = [moved_mm(arm.joints, np.roll(arm.joints, -1, axis=0), arm.instrument) for arm in arms]

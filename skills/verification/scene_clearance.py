@@ -34,7 +34,7 @@ from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
 from skills.planning.motion_laws import A2, TRANSFER
 from skills.planning.trajectory import PSM_A, PSM_M, PlannedArm, SampleMoment, Trajectory
 from skills.verification import clearance
-from skills.verification.bodies import ABOVE_TISSUE, TOOL, moved_mm, names_of, parts_of, radii_of
+from skills.verification.bodies import ABOVE_TISSUE, TOOL, moved_mm, names_of, placed, radii_of
 from skills.verification.clearance import way_mm
 from skills.verification.playback import CLEARANCE_SEEN_MM, LINKS
 
@@ -201,6 +201,7 @@ def groups_of(trajectory: Trajectory) -> list[tuple[PlannedArm, Group]]:
 
 
 def _tool(arm: PlannedArm) -> Group:
+    """Return the capsules of an arm's tool."""
     steps = clearance.travel_mm(arm.joints, arm.instrument)
     if arm.name == PSM_A:
         steps[:, clearance.FINGERS] += clearance.FINGER_REACH_MM * np.abs(np.diff(clearance.openings(arm)))[:, None]
@@ -208,11 +209,13 @@ def _tool(arm: PlannedArm) -> Group:
 
 
 def _bodies(arm: PlannedArm) -> Group:
+    """Return the capsules of an arm's outer bodies, without its shaft and hand."""
     names = names_of(arm.instrument)[: -len(TOOL)]
     way = way_mm(moved_mm(arm.joints[:-1], arm.joints[1:], arm.instrument)[:, : len(names)])
 
     def axes(at: Ints) -> tuple[clearance.Links, ...]:
-        parts = parts_of(arm.joints[at], arm.instrument).seen_from(arm.base, arm.base_mm)
+        """Return the axes of the bodies at some samples."""
+        parts = placed(arm, arm.joints[at])
         return (clearance.Links(parts.begin_mm[:, : len(names)], parts.end_mm[:, : len(names)]),)
 
     radii, above = radii_of(arm.instrument)[: len(names)], np.isin(names, ABOVE_TISSUE)

@@ -28,8 +28,7 @@ from numpy.typing import ArrayLike
 from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo, partner_motion
 from skills.demonstration.movement import press_times, same_signs, smoothed_speed
-from skills.demonstration.partner import STEADY_MM
-from skills.demonstration.recording import Motion, Recording
+from skills.demonstration.recording import STEADY_MM, Motion, Recording
 from skills.fields import Column, Count, schema
 from skills.kinematics import INSTRUMENTS, matrix_of, quaternion_of
 from skills.planning.motion_laws import PHASES
@@ -171,12 +170,14 @@ class _Clock:
 
     @classmethod
     def of(cls, start_s: float, end_s: float, rate_hz: float) -> "_Clock":
+        """Return the rows from one time to another, at a rate or a lower one that `RATE_HZ` and `MOST_ROWS` allow."""
         rate_hz = min(rate_hz, RATE_HZ, (MOST_ROWS - 1) / max(end_s - start_s, 1e-9))
         rows = 1 + int((end_s - start_s) * rate_hz + 1e-6)
         return cls(start_s + np.arange(rows) / rate_hz, rate_hz)
 
     @property
     def every(self) -> int:
+        """Rows between two rows of bodies."""
         return max(1, int(self.rate_hz / BODIES_HZ))
 
     def column(self, stamps_s: Floats, values: ArrayLike) -> Floats:
@@ -267,6 +268,7 @@ class _Clock:
 
 
 def _column(values: Floats) -> Any:
+    """Return values as a read-only column of 32-bit floats."""
     column = np.array(values, np.float32)
     column.setflags(write=False)
     return column
@@ -321,6 +323,7 @@ def timeline_of_demo(recording: Recording, demo: Demo) -> Timeline:
 
 
 def _rate_hz(motions: Sequence[Motion]) -> float:
+    """Return the highest rate of the motions, from the median steps of their stamps; 1 if none has two samples."""
     return max((1e9 / float(np.median(np.diff(m.stamps_ns))) for m in motions if len(m.stamps_ns) > 1), default=1.0)
 
 
@@ -347,6 +350,7 @@ def _signals(recording: Recording, arm: str) -> tuple[_Samples | None, _Samples 
 
 
 def _base(recording: Recording, motion: Motion) -> _Base | None:
+    """Return the base of a motion's arm in the motion's frame; None if its place is not known or it moved."""
     if motion.states_base:
         return np.eye(3), np.zeros(3)
     for base in recording.bases:
@@ -362,6 +366,7 @@ def _session(recording: Recording, start_s: float, end_s: float) -> dict[str, An
     down = [(first, last_ns if last is None else last) for first, last in presses]
 
     def within(spans_ns: Sequence[tuple[int, int]]) -> list[tuple[float, float] | None]:
+        """Return intervals in s since the recording's origin; None for those outside of the part."""
         spans = recording.seconds(np.array(spans_ns, np.int64).reshape(-1, 2)).tolist()
         return [(first, last) if last > start_s and first < end_s else None for first, last in spans]
 

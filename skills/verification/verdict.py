@@ -351,6 +351,7 @@ def judge_plan(
 
 
 def _check_same(playback: Playback, trajectory: Trajectory) -> None:
+    """Refuse a playback of another trajectory; raises as `judge`."""
     if len(playback) != len(trajectory):
         raise BadInput(
             f"The playback has {len(playback)} samples, the trajectory {len(trajectory)}; play this trajectory.",
@@ -362,6 +363,7 @@ def _check_same(playback: Playback, trajectory: Trajectory) -> None:
 
 
 def _arm_report(arm: ArmSamples) -> ArmFigures:
+    """Return the ranges and peaks of an arm's joints."""
     rows = zip(
         kinematics.JOINTS,
         kinematics.UNITS,
@@ -395,6 +397,7 @@ def _clearances(playback: Playback, trajectory: Trajectory, figures: Figures) ->
 
 
 def _needle(playback: Playback, trajectory: Trajectory, figures: Figures) -> tuple[NeedleClearance, ...]:
+    """Return the least distance of the needle from the pad in each phase that was measured."""
     phase_seen = trajectory.phase[playback.looked_at]
     found = []
     for phase, name in enumerate(PHASES):
@@ -407,6 +410,7 @@ def _needle(playback: Playback, trajectory: Trajectory, figures: Figures) -> tup
 def _ends(
     playback: Playback, trajectory: Trajectory, figures: Figures, approach_m: ArrayLike | None
 ) -> tuple[PassEnd, ...]:
+    """Return the figures at the end of each pass."""
     last = trajectory.last_samples
     jaws = kinematics.matrix_of(trajectory.rotation_xyzw)
     approaches = _approaches(trajectory, approach_m)
@@ -448,5 +452,6 @@ def _angles_deg(approach: Floats, jaw: Floats) -> tuple[float, float]:
 
 
 def _least(playback: Playback, other: str) -> float:
+    """Return the least measured distance from a body."""
     columns = [k for k, pair in enumerate(playback.link_pairs) if pair.other == other]
     return float(playback.clearances_mm[:, columns].min())

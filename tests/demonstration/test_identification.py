@@ -81,6 +81,14 @@ def test_the_base_is_found_where_it_stands_and_needs_no_orientations():
         assert found.residual_mm < 1e-9
 
 
+@pytest.mark.parametrize("off_mm", [0.5, 50.0])
+def test_poses_that_are_off_the_stated_base_keep_the_stated_instrument(off_mm):
+    joints = random_joints(500, 2)
+    tip_mm, rotation = forward(joints)
+    found = identify(joints, tip_mm + np.array([off_mm, 0, 0]), rotation, in_base=True, stated="400006")
+    assert (found.verdict, found.stated) == ("wrong frame", "400006")
+
+
 def test_a_motion_too_small_to_tell_two_shafts_apart_identifies_nothing():
     joints = random_joints(500, 3, spread=0.0) + [0, 0, 1, 0, 0, 0] * np.linspace(0, 10, 500)[:, None]  # straight in
     tip_mm, rotation = forward(joints)

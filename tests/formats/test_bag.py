@@ -120,6 +120,7 @@ PLAIN = metadata(["x.mcap"], COUNTS).decode()
         PLAIN + "---\n" + PLAIN,
         PLAIN.replace("message_count: 40\n", "message_count: -40\n"),
         PLAIN.replace("message_count: 40\n", "message_count: [40]\n"),
+        PLAIN.replace("message_count: 40\n", f"message_count: {10**18}\n"),
         PLAIN.replace("topic_metadata", "metadata"),
         PLAIN.replace("- x.mcap", "- [x.mcap]"),
         PLAIN.replace("    - x.mcap\n", ""),
@@ -129,7 +130,7 @@ PLAIN = metadata(["x.mcap"], COUNTS).decode()
     ],
     ids=[
         *("directive", "late directive", "alias", "alias of itself", "depth", "parts", "characters", "two documents"),
-        *("negative", "list", "no topics", "file list", "no files", "no mapping", "cut", "empty"),
+        *("negative", "list", "digits", "no topics", "file list", "no files", "no mapping", "cut", "empty"),
     ],
 )
 def test_metadata_that_are_no_bags_or_a_bomb_are_refused(text):

@@ -54,6 +54,8 @@ def with_cell(row, column, value):
         (table([]), errors.UnreadableRecording, "no rows"),
         (table(with_cell(3, 8, "far")), errors.UnreadableRecording, "Row 7"),
         (table([*LINES[:3], LINES[3][:5]]), errors.UnreadableRecording, "Row 7"),
+        (table(with_cell(3, 8, "0.0_1")), errors.UnreadableRecording, "Row 7"),
+        (table(with_cell(3, 2, 10**9)), errors.UnreadableRecording, "Row 7"),
         (table(with_cell(3, 8, "nan")), errors.NotFinite, LOCAL),
         (table(with_cell(3, 1, "ECM")), errors.MixedFrames, "2 frames"),
         (table(with_cell(3, 3, 17)), errors.BackwardStamps, LOCAL),

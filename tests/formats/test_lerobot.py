@@ -422,7 +422,7 @@ def test_pictures_within_the_data_are_not_cut_out(tmp_path):
     read_recording(io.BytesIO(alone), frame="ECM")
 
 
-@pytest.mark.parametrize("which", ["3", "-1", "x", "99999999999999999999", ""])
+@pytest.mark.parametrize("which", ["3", "-1", "x", "99999999999999999999", "00000000001", ""])
 def test_an_episode_that_is_not_there_is_refused_with_those_that_are(tmp_path, which):
     with find_dataset(write(dataset("v2.1"), tmp_path)) as found, pytest.raises(errors.BadInput, match="it has 0 to 2"):
         choose_episodes(found, which)

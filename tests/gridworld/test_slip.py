@@ -29,6 +29,12 @@ def test_a_slip_that_is_no_probability_is_refused(slip):
         slip_model(slip)
 
 
+@pytest.mark.parametrize("drawn", [np.full(27, 0.1), np.append(np.full(26, 1 / 13), -1.0)])
+def test_moves_that_are_drawn_with_no_probabilities_are_refused(drawn):
+    with pytest.raises(BadSettings, match="sum 1"):
+        SlipModel(0.1, drawn)
+
+
 @pytest.mark.parametrize(("runs", "moves", "seed"), [(0, 1, 0), (1, 0, 0), (1, 1, -1)])
 def test_slips_of_nothing_are_refused(runs, moves, seed):
     with pytest.raises(BadSettings, match="at least one run"):

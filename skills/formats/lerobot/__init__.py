@@ -30,10 +30,8 @@ from skills.errors import BadColumns, UnreadableRecording
 from skills.formats.archive import printable, shown
 from skills.formats.lerobot.parquet import ParquetColumn, open_parquet, read_rows
 
-INFO, STATEMENTS, EPISODE_LINES, TASK_LINES, TASK_TABLE = (
-    *("meta/info.json", "meta/suture-skills.json", "meta/episodes.jsonl"),
-    *("meta/tasks.jsonl", "meta/tasks.parquet"),
-)
+INFO, STATEMENTS, EPISODE_LINES = "meta/info.json", "meta/suture-skills.json", "meta/episodes.jsonl"
+TASK_LINES, TASK_TABLE = "meta/tasks.jsonl", "meta/tasks.parquet"
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 JSON_CHARACTERS = 4 << 20  # the metadata of 100 features have 20,000
 NUMBERS = 5000  # of all features together
@@ -244,6 +242,11 @@ def read_dataset(files: Files, root: str) -> Dataset:
 
 
 def _feature(name: str, described: Any) -> Feature:
+    """Return a feature from its description in info.json.
+
+    Raises:
+        UnreadableRecording: It has no type, no plausible shape, or not as many names as numbers.
+    """
     try:
         dtype, shape, names = str(described["dtype"]), described["shape"], described.get("names")
         if dtype in ("image", "video"):
@@ -285,6 +288,7 @@ def _tasks_in(file: BinaryIO) -> dict[int, str]:
 
 
 def _object(files: Files, name: str) -> Json:
+    """Return a file that is a JSON object; any other raises `UnreadableRecording`."""
     parsed = _parsed(files.text(name), name)
     if not isinstance(parsed, dict):
         raise UnreadableRecording(f"{shown(name)} of the dataset is not a JSON object.")
@@ -292,6 +296,7 @@ def _object(files: Files, name: str) -> Json:
 
 
 def _parsed(text: str, name: str) -> Any:
+    """Return JSON of limited length; any other text raises `UnreadableRecording`."""
     if len(text) > JSON_CHARACTERS:
         raise UnreadableRecording(f"{shown(name)} of the dataset has more than {JSON_CHARACTERS} characters.")
     try:

@@ -127,7 +127,7 @@ def choose_episodes(dataset: Dataset, which: str | None) -> list[Episode]:
         raise several_episodes(len(episodes))
     if which is None or which == "all":
         return list(episodes.values())
-    if not which.isdecimal() or int(which[:10]) not in episodes:
+    if not (which.isdecimal() and len(which) <= 9 and int(which) in episodes):  # of more digits none is a number
         raise BadInput(f"The dataset has no episode {which[:80]!r}; it has {_listed(episodes)}.")
     return [episodes[int(which)]]
 
@@ -270,6 +270,7 @@ def _json(value: object) -> bytes:
 
 
 def _listed(episodes: Mapping[int, Episode]) -> str:
+    """Return the numbers of the episodes in words."""
     numbers = list(episodes)
     whole = numbers == list(range(numbers[0], numbers[-1] + 1))
     return f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers[:50]))

@@ -50,7 +50,7 @@ from skills.formats import columns
 from skills.formats.archive import printable
 from skills.formats.lerobot import INFO, STATEMENTS, VERSIONS, Dataset, Feature, Files, read_dataset
 from skills.formats.lerobot.parquet import ParquetTable, read_columns
-from skills.kinematics import INSTRUMENTS
+from skills.kinematics import INSTRUMENTS, JOINTS
 from skills.remedies import Action, Remedy, did_you_mean
 
 NOTE_CHARACTERS = 200
@@ -80,7 +80,6 @@ _ROS_ANGLE = re.compile(_ROS + r"(jaw\.)?(measured_js|setpoint_js)\.position\.([
 _BARE_JOINTS, _BARE_JAW = tuple(f"joint_{k}" for k in range(6)), "jaw"
 _TOOL = re.compile(r"(?:observation\.meta\.tool\.)?(psm\d{1,2})(?:_tool_type)?", re.I)
 _NUMBER = re.compile(r"(?:^|:)(\d+)(?:\[|$)")  # of "LARGE_NEEDLE_DRIVER:400006[..11]", or alone
-_JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 _SCALARS = ("timestamp", "frame_index", "episode_index", "task_index")
 _CLOCKS = "observation.meta.ros_time_sec", "observation.meta.ros_time_nsec", "timestamp_ns"
 _SEC, _NANOSEC, _STAMP = _CLOCKS
@@ -207,6 +206,7 @@ def several_episodes(episodes: int) -> UnreadableRecording:
 
 
 def _check_one_episode(dataset: Dataset, table: ParquetTable) -> None:
+    """Refuse data of no frames, of several episodes, or of another length than the metadata claim."""
     if not table.rows:
         raise UnreadableRecording("The episode has no frames.")
     numbers = table.column("episode_index")
@@ -278,7 +278,7 @@ def meaning_of(name: str) -> tuple[str, str, int] | None:
         return pose[1].upper(), kind, columns.POSE_PARTS.index(pose[4].lower())
     if joint := _JOINT.fullmatch(name):
         which, kind = joint[3].lower(), "joint_setpoints" if joint[2] else "joints"
-        return joint[1].upper(), kind, int(which) - 1 if which.isdecimal() else _JOINT_NAMES.index(which)
+        return joint[1].upper(), kind, int(which) - 1 if which.isdecimal() else JOINTS.index(which)
     if jaw := _JAW.fullmatch(name):
         return jaw[1].upper(), "jaw_setpoint" if jaw[2] else "jaw", 0
     if pose := _ROS_POSE.fullmatch(name):
@@ -327,7 +327,7 @@ def _incomplete(quantity: columns.Quantity, places: Mapping[int, Place]) -> str 
     arm, kind = quantity
     if kind.startswith("jaw"):
         return None
-    names = _JOINT_NAMES if kind.startswith("joint") else columns.POSE_PARTS
+    names = JOINTS if kind.startswith("joint") else columns.POSE_PARTS
     count = 3 if kind in ("pose", "local_pose") and max(places) < 3 else len(names)
     missing = next((names[k] for k in range(count) if k not in places), None)
     return missing and f"The {kind} of {arm} has no column {missing}; all parts are needed."
@@ -517,6 +517,7 @@ def _check_rate(dataset: Dataset, table: ParquetTable, stamps_ns: Ints, clock: s
 
 
 def _in_ns(seconds: Floats) -> Ints:
+    """Convert seconds to whole nanoseconds, shape (T,)."""
     if not (np.abs(seconds) < 9e9).all():
         raise UnreadableRecording("A timestamp is after the year 2255; give seconds.")
     whole = np.floor(seconds)  # apart, so that the fraction keeps its digits

@@ -61,6 +61,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def _copied(file: BinaryIO, folder: Path | None) -> list[str]:
+    """Verify every file, and write it into the folder if there is one; raises as `check_dataset`."""
     with refusing("The dataset's zip", AGAIN), ZipFile(file) as archive:
         found = {one.filename: one for one in archive.infolist()}
         named = _manifest(archive) if SUMS in found else {}
@@ -77,6 +78,7 @@ def _copied(file: BinaryIO, folder: Path | None) -> list[str]:
 
 
 def _manifest(archive: ZipFile) -> dict[str, str]:
+    """Return the SHA-256 of each file that the manifest names."""
     if archive.getinfo(SUMS).file_size > _MANIFEST_BYTES:
         raise Corrupt(f"The dataset's manifest is too long. {AGAIN}")
     return read_sums(archive.read(SUMS).decode("ascii"))

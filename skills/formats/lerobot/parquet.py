@@ -96,13 +96,12 @@ def open_parquet(file: BinaryIO) -> Any:
         )
 
 
-def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows: int = ROWS) -> ParquetTable:
-    """Read some columns of a file.
+def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn]) -> ParquetTable:
+    """Read some columns of a file of at most `ROWS` rows.
 
     Args:
         file: The file, seekable.
         columns: At least one; a file without one of them is refused.
-        most_rows: The greatest number of rows.
 
     Raises:
         UnreadableRecording: The file is damaged or claims too much; or a column is missing, of another type or length,
@@ -111,7 +110,7 @@ def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows:
     from pyarrow import types
 
     opened = open_parquet(file)
-    rows = _checked_rows(opened, [one.name for one in columns], file.seek(0, os.SEEK_END), most_rows)
+    rows = _checked_rows(opened, [one.name for one in columns], file.seek(0, os.SEEK_END))
     numbers: dict[str, NDArray[np.floating]] = {}
     texts: dict[str, list[set[str]]] = {one.name: [set() for _ in range(one.width)] for one in columns if one.is_text}
     at = 0
@@ -137,7 +136,11 @@ def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows:
 
 
 def read_rows(file: BinaryIO, names: Sequence[str], *, most_rows: int) -> list[dict[str, Any]]:
-    """Read some columns of a short table as Python's values, of any type; arguments and errors as `read_columns`."""
+    """Read some columns of a table of at most `most_rows` rows as Python's values, of any type.
+
+    Raises:
+        UnreadableRecording: As for `read_columns`, but for the types and gaps of the values.
+    """
     opened = open_parquet(file)
     _named_rows(opened, names, most_rows)
     # of whole row groups: in a damaged file pyarrow ends the process when it is asked about a column of one
@@ -152,14 +155,14 @@ def read_rows(file: BinaryIO, names: Sequence[str], *, most_rows: int) -> list[d
     return rows
 
 
-def _checked_rows(opened: Any, wanted: Collection[str], size: int, most_rows: int) -> int:
+def _checked_rows(opened: Any, wanted: Collection[str], size: int) -> int:
     """Return the number of rows, if the memory that the columns take is plausible for the size of the file.
 
     Raises:
         UnreadableRecording: A column is missing or there twice, or they would take too much.
     """
     about = opened.metadata
-    rows = _named_rows(opened, wanted, most_rows)
+    rows = _named_rows(opened, wanted, ROWS)
     # pyarrow reads everything below a dotted name: for `a` also the column `a.b`
     leaves = [k for k in range(about.num_columns) if _is_below(about.schema.column(k).path, wanted)]
     total = texts = 0

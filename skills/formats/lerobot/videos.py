@@ -218,6 +218,7 @@ class _Shown:
 
 
 def _shown(folder: Path, chosen: Iterable[EpisodeSource]) -> _Shown:
+    """Return the videos of the chosen episodes of a folder, and what it says of them."""
     with find_dataset(folder) as dataset:
         assert dataset is not None
         cameras = _cameras(folder, dataset)
@@ -267,6 +268,11 @@ def _files(folder: Path) -> dict[_Key, Path]:
 def _clip(
     source: EpisodeSource, camera: str, places: Mapping[int, Json] | None, files: Mapping[tuple[str, int, int], Path]
 ) -> Clip:
+    """Return the frames of one camera in one episode.
+
+    Raises:
+        BadInput: Its video is missing, or its times are not those of its frames.
+    """
     first, key = 0, (camera, -1, source.number)
     if places is not None:
         chunk, file, start_s, end_s = (places[source.number][f"videos/{camera}/{part}"] for part in _PLACE)
@@ -351,6 +357,7 @@ def _describe(videos: Videos, said: Sequence[Mapping[str, tuple[str | None, bool
 
 
 def _feature(header: Mp4, pixels: str | None, is_depth: bool, fps: float) -> Json:
+    """Return a camera as a feature of info.json."""
     channels = 1 if pixels is not None and pixels.startswith("gray") else 3
     info = {
         "video.height": header.height,
@@ -421,6 +428,7 @@ def add_videos(folder: Path, videos: Videos) -> None:
 
 
 def _words(videos: Videos) -> str:
+    """Return the part of the README about the cameras."""
     cameras = "".join(f"- `{name}`: {_describe_camera(one)}\n" for name, one in videos.cameras.items())
     return f"""Cameras:
 
@@ -499,6 +507,7 @@ def _nested(stats: Stats) -> dict[str, list[Any]]:
 
 
 def _copy(folder: Path, name: str, path: Path, videos: Videos, sums: dict[str, str]) -> None:
+    """Copy a video, and compare its header with the one that was checked."""
     to = folder / name
     to.parent.mkdir(parents=True, exist_ok=True)
     with path.open("rb") as file, to.open("x+b") as out:

@@ -185,6 +185,7 @@ def dataset_files(
 def _files(
     episodes: Iterable[ExportedEpisode], about: AboutDataset, version: Version
 ) -> Iterator[tuple[str, IO[bytes]]]:
+    """Yield the files of a dataset, without its manifest."""
     total = _Total(about)
     with TemporaryFile() as first, TemporaryFile() as second:
         store = _SingleFiles(first, second) if version == "v2.1" else _SharedFiles(first, second)
@@ -258,6 +259,7 @@ class _Total:
         return added
 
     def _add_to_split(self, split: Split) -> None:
+        """Count an episode in its split; raises `BadInput` if the splits are not in order."""
         if any(SPLITS.index(before) > SPLITS.index(split) for before in self.splits):
             raise BadInput(f"Give the episodes in the order of their splits: {', '.join(SPLITS)}.", split=split)
         self.splits.setdefault(split, [self.episodes, self.episodes])[1] += 1
@@ -296,6 +298,7 @@ class _Total:
         return self._numbers(series, episode, times_ns)
 
     def _numbers(self, series: "list[_Series]", episode: ExportedEpisode, times_ns: Ints) -> Singles:
+        """Return the samples of series that are nearest to some times, side by side."""
         numbers = [one.at(times_ns, 1e9 / self.about.fps, self._name(episode)) for one in series]
         return np.concatenate(numbers, axis=1).astype(np.float32)
 
@@ -517,6 +520,7 @@ class _SharedFiles:
         yield "meta/stats.json", io.BytesIO(as_json(_by_column(total.numbers, total.widths)))
 
     def _finished_file(self) -> Iterator[tuple[str, IO[bytes]]]:
+        """Close the present data file, yield it, and begin the next one."""
         self._writer.close()
         yield _V30_DATA.format(chunk_index=self._file // CHUNK, file_index=self._file % CHUNK), self._data
         self._data.seek(0)
@@ -524,6 +528,7 @@ class _SharedFiles:
         self._writer, self._file, self._bytes, self._episodes = None, self._file + 1, 0, 0
 
     def _write_places(self) -> None:
+        """Write the waiting episodes to the table of places."""
         import pyarrow as pa
         from pyarrow import parquet
 

@@ -208,6 +208,11 @@ class _Log:
 
 
 def _read_log(file: BinaryIO, meaning: MeaningOf) -> _Log:
+    """Read a file, and decode the messages of its used topics.
+
+    Raises:
+        NeedsRosbags: One of them is defined in another language.
+    """
     log = _Log(Walker(file), meaning)
     for part in log.walker.parts():
         log.take(part)
@@ -232,6 +237,7 @@ def _text(schema: MessageSchema) -> str:
 
 
 def _check_encoding(channel: Channel, schema: MessageSchema) -> None:
+    """Refuse messages in another encoding than CDR with ros2msg definitions."""
     if channel.encoding == "ros1":
         raise UnreadableRecording(
             f"The MCAP file has the messages of a ROS 1 bag ({channel.topic}), which are not read from MCAP. Send the "
@@ -251,6 +257,7 @@ def _ros2_name(name: str) -> str:
 
 
 def _recording(log: _Log) -> recording.Recording:
+    """Return the recording of decoded messages; raises as `read_mcap`."""
     found: dict[TopicKind, list[tuple[str, Any]]] = {kind: [] for kind in TopicKind}  # owners and their values
     for topic in sorted(log.topics.values(), key=lambda topic: topic.name):
         kind, owner = topic.meaning.kind, topic.meaning.owner
@@ -289,6 +296,7 @@ def _recording(log: _Log) -> recording.Recording:
 
 
 def _motion(topic: _Topic) -> recording.Motion:
+    """Return the motion of a topic of poses, in mm."""
     stamps_ns, poses = _in_order(topic)
     with np.errstate(over="ignore"):  # infinite values are refused below
         tip_mm = 1000.0 * poses[:, :3]  # ROS messages are in metres
@@ -303,6 +311,7 @@ def _motion(topic: _Topic) -> recording.Motion:
 
 
 def _one_frame(topic: _Topic) -> str:
+    """Return the frame of all poses of a topic; raises `MixedFrames` if there are several."""
     frames = list(dict.fromkeys(frame for columns in topic.columns for frame in columns.labels_in_order))
     if len(frames) > 1:
         raise MixedFrames(
@@ -315,6 +324,7 @@ def _one_frame(topic: _Topic) -> str:
 
 
 def _joints(topic: _Topic) -> recording.Joints:
+    """Return the joints of a topic, the insertion of a PSM in mm."""
     stamps_ns, positions = _in_order(topic)
     if topic.meaning.owner.upper().startswith("PSM"):
         if positions.shape[1] <= INSERTION:
@@ -326,6 +336,7 @@ def _joints(topic: _Topic) -> recording.Joints:
 
 
 def _signal(topic: _Topic) -> recording.Signal:
+    """Return the first value of each message of a topic as a signal."""
     stamps_ns, values = _in_order(topic)
     if values.shape[1] == 0:
         raise NoUsableTopic(
@@ -436,6 +447,7 @@ def _concatenated(arrays: list[NDArray[Any]]) -> NDArray[Any]:
 
 
 def _stamps(topic: _Topic) -> Iterable[Ints]:
+    """Yield the stamps of a topic part by part: those of the headers, or else of the reception."""
     is_unset = topic.is_unset
     for columns in topic.columns:
         if columns.stamps_ns is not None and not is_unset:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skills.arrays import Flags, Floats, Ints
+from skills.demonstration.recording import NS_PER_S
 from skills.errors import UnreadableRecording
 from skills.formats.mcap import _kernels
 from skills.formats.mcap.records import HEAD, MESSAGE, Bytes, looked_at
@@ -45,7 +46,6 @@ _FIELD = re.compile(r"^([\w/]+)(?:<=\d+)?(\[(?:<=)?\d*\])?\s+(\w+)\s*(=?)")
 
 SLACK_BYTES = 8  # after the data, because the last word of a message may extend beyond it
 SPARE_BYTES = 7  # some middleware pads a message to a multiple of 4 or 8
-_NANO = 1_000_000_000
 _ENCAPSULATION_BYTES = 4
 HEAD_BYTES = HEAD.size + MESSAGE.size  # the header, before the content of a message
 _LOG_AT = 15  # position of the log time in it (MCAP specification, "Message")
@@ -109,6 +109,7 @@ def _short(name: str) -> str:
 
 
 def _add_fields(fields: list[Field], parts: dict[str, list[str]], name: str, *, prefix: str, depth: int) -> None:
+    """Append the fields of a message type, and of those nested in it; raises as `fields_of`."""
     if name not in parts or depth > DEPTH_LIMIT:
         raise UnreadableRecording(f"{name} is not defined in the file, or contains itself.")
     declared = [match for match in map(_FIELD.match, parts[name]) if match is None or not match[4]]
@@ -223,7 +224,7 @@ class Shape:
         stamps_ns = None
         if self.stamp:
             seconds, nanoseconds = (run.numbers(taken)[:, 0] for run in self.stamp)
-            stamps_ns = np.multiply(seconds, _NANO, dtype=np.int64)
+            stamps_ns = np.multiply(seconds, NS_PER_S, dtype=np.int64)
             stamps_ns += nanoseconds
         runs = [run.numbers(taken).astype(np.float64, copy=False) for run in self.runs]
         values = runs[0] if len(runs) == 1 else np.concatenate([np.zeros((len(taken), 0)), *runs], axis=1)

@@ -188,6 +188,7 @@ class Walker:
     # ---- the file's records
 
     def _begin(self) -> None:
+        """Read the magic bytes and the header."""
         if self._source.take(len(MAGIC)) != MAGIC:
             raise UnreadableRecording("This is not an MCAP file: its first bytes differ.")
         opcode, length = self._source.head()
@@ -232,6 +233,7 @@ class Walker:
         return bytes(self._source.take(chain.end))
 
     def _chunk(self, length: int) -> tuple[bytes, bool]:
+        """Return the records of a chunk, and whether a checksum covers them."""
         self._count()
         self._chunks += 1
         if not _CHUNK.size <= length <= 2 * CHUNK_LIMIT_BYTES:
@@ -247,6 +249,7 @@ class Walker:
         return data, checksum != 0
 
     def _check_size(self, size: int) -> None:
+        """Refuse a chunk that would unpack to too much, by itself or with those before."""
         self._unpacked_bytes += size
         allowed = min(TOTAL_LIMIT_BYTES, CHUNK_LIMIT_BYTES + RATIO_LIMIT * self._source.position)
         if size > CHUNK_LIMIT_BYTES or self._unpacked_bytes > allowed:
@@ -259,6 +262,7 @@ class Walker:
             )
 
     def _metadata(self, length: int) -> None:
+        """Keep the notes of our own writer, and skip any other metadata."""
         self._count()
         if length > NOTES_LIMIT_BYTES:
             self._source.skip(length)
@@ -268,6 +272,7 @@ class Walker:
             self.notes.update(fields.texts())
 
     def _check_data_end(self, checksum: int) -> None:
+        """Compare the checksum of the data section with the one in its last record."""
         _, length = self._source.head()
         said = Fields(self._source.take(length)).number(4)
         if said and said != checksum:
@@ -321,6 +326,7 @@ class Walker:
         self._statistics = True
 
     def _definition(self, opcode: int, length: int) -> memoryview:
+        """Return the content of a record that is kept in memory, if it is not too long."""
         if length > DEFINED_LIMIT_BYTES:
             raise UnreadableRecording(f"A record of kind {opcode:#x} has {length} bytes, over the limit. {RECOVER}")
         return self._source.take(length)
