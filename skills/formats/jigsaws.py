@@ -65,6 +65,7 @@ HEADER = ",".join(
 _GESTURE = re.compile(r"\s*(\d{1,7})\s+(\d{1,7})\s+(G\d{1,2})\s*")
 _PRIMITIVES = re.compile(r"\s*(\d{1,7})\s+(\d{1,7})\s+((?:[A-Z][a-z]+\(\w+, [\w/]+\)\s*)+)")
 _TRIAL_OF_COMPASS = re.compile(r"([A-Za-z_]+)_S(0[1-9]|1\d|2[0-6])_T(\d{2})")
+_RATING = re.compile(r"[0-9]{1,4}")
 _TRIAL = re.compile(r"(?P<task>[A-Za-z_]+)_(?P<user>[A-Z])(?P<number>\d{3})")
 
 
@@ -158,8 +159,8 @@ def read_meta(text: str) -> dict[str, RatedTrial]:
     rated = {}
     for line in text.splitlines():
         cells = line.split()
-        if len(cells) == 3 + len(PARTS) and cells[1] in SKILLS and all(cell.isdecimal() for cell in cells[2:]):
-            score, *parts = (int(cell[:4]) for cell in cells[2:])
+        if len(cells) == 3 + len(PARTS) and cells[1] in SKILLS and all(_RATING.fullmatch(cell) for cell in cells[2:]):
+            score, *parts = map(int, cells[2:])
             rated[cells[0]] = RatedTrial(cells[0], SKILLS[cells[1]], score, tuple(parts))
     return rated
 

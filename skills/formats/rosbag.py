@@ -18,7 +18,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -170,15 +170,16 @@ def merge_log(path: Path) -> None:
         UnreadableRecording: It contains anything but a rosbag2, or the log is damaged.
     """
     has_log = Path(f"{path}-wal").is_file()
-    with refusing(_NAMES[".db3"], "Copy the folder of the bag again, with its -wal."):
-        connection = apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READWRITE)
+    with (
+        refusing(_NAMES[".db3"], "Copy the folder of the bag again, with its -wal."),
+        closing(apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READWRITE)) as connection,
+    ):
         connection.authorizer = None  # ours alone are the statements here
         frames, _ = connection.wal_checkpoint(mode=apsw.SQLITE_CHECKPOINT_FULL)
         if (has_log and frames <= 0) or connection.pragma("journal_mode", "delete") != "delete":
             raise UnreadableRecording(
                 "The write-ahead log (-wal) beside the SQLite bag (.db3) is damaged or of another. Copy both again."
             )
-        connection.close()
 
 
 def read_rosbag(

@@ -96,7 +96,8 @@ class Physics:
         for field in fields(self):
             value = getattr(self, field.name)
             if not (isfinite(value) and 0 <= value <= 1e6 and (value > 0 or field.name == "friction")):
-                raise BadSettings(f"{field.name} of the contacts must be more than 0, at most 1e6.", given=value)
+                least = "at least" if field.name == "friction" else "more than"
+                raise BadSettings(f"{field.name} of the contacts must be {least} 0, at most 1e6.", given=value)
         if not (self.step_s <= 0.0005 and self.contact_s >= 2.5 * self.step_s):
             raise BadSettings(
                 "step_s must be at most 0.0005, and contact_s at least 2.5 times as long; make step_s smaller.",

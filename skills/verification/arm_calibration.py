@@ -202,7 +202,8 @@ def tracked_errors_mm(measured: MeasuredArm) -> Floats:
         Errors in mm, shape (N, 3).
 
     Raises:
-        BadInput: There is no tracker, the samples hold too few independent ones, or the errors are the same throughout.
+        BadInput: There is no tracker, the samples hold too few independent ones, the marker's place does not settle, or
+            the errors are the same throughout.
     """
     if measured.marker_mm is None:
         raise BadInput("The recording has no tracker.")
@@ -219,6 +220,8 @@ def tracked_errors_mm(measured: MeasuredArm) -> Floats:
         marker = fitted
         if done:
             break
+    else:  # NaN comes here too
+        raise BadInput("The marker's place in the tool frame cannot be found from these samples; turn the wrist more.")
     return _checked(np.asarray(shown - tip - jaw @ marker))
 
 

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo, partner_motion
 from skills.demonstration.movement import press_times, same_signs, smoothed_speed
-from skills.demonstration.recording import STEADY_MM, Motion, Recording
+from skills.demonstration.recording import Motion, Recording
 from skills.fields import Column, Count, schema
 from skills.kinematics import INSTRUMENTS, matrix_of, quaternion_of
 from skills.planning.motion_laws import PHASES
@@ -354,7 +354,7 @@ def _base(recording: Recording, motion: Motion) -> _Base | None:
     if motion.states_base:
         return np.eye(3), np.zeros(3)
     for base in recording.bases:
-        if base.is_of(motion) and base.spread_mm <= STEADY_MM:
+        if base.is_of(motion) and base.is_steady:
             return matrix_of(np.array([base.rotation_xyzw]))[0], np.asarray(base.position_mm)
     return None
 

@@ -189,7 +189,10 @@ def test_the_meta_file_says_how_the_trial_was_rated():
     rated = read_meta(META)
     assert rated["Suturing_C002"] == RatedTrial("Suturing_C002", "expert", 27, (5, 4, 5, 4, 5, 4))
     assert all(sum(one.parts) == one.score for one in rated.values())
-    assert read_meta(meta_line(rated["Suturing_B001"])) == {"Suturing_B001": rated["Suturing_B001"]}
+    line = meta_line(rated["Suturing_B001"])
+    assert read_meta(line) == {"Suturing_B001": rated["Suturing_B001"]}
+    score = str(rated["Suturing_B001"].score)
+    assert read_meta(line.replace(score, f"{score}00000", 1)) == {}, "a number is never cut"
 
 
 def test_the_trials_of_a_folder_are_found_with_what_belongs_to_them(tmp_path):

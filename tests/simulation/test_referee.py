@@ -189,8 +189,9 @@ def test_requests_that_make_no_sense_are_refused():
         {"step_s": 0.001},
         {"contact_s": 0.001},
     ):
-        with pytest.raises(BadSettings):
+        with pytest.raises(BadSettings) as refused:
             Physics(**numbers)
+        assert ("must be at least 0" in refused.value.message) == ("friction" in numbers)
 
 
 def test_without_mujoco_the_remedy_is_named(monkeypatch):

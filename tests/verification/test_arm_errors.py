@@ -15,6 +15,7 @@ from skills.kinematics import forward
 from skills.library.plans.arm_errors import stated_errors
 from skills.schemas.playbacks import PlaybackIn
 from skills.settings import Settings
+from skills.verification import arm_calibration
 from skills.verification.arm_calibration import LEAST_EFFECTIVE, MeasuredArm, calibrate_arm, effective_number
 from skills.verification.arm_errors import CALIBRATED, CALLED, NAMED, SIZES, UNCALIBRATED, ArmErrors
 from skills.verification.error_draws import rotation_of
@@ -132,7 +133,7 @@ def test_too_few_independent_samples_are_refused():
         calibrate_arm(recorded(10), name="ours")
 
 
-def test_a_tracker_shows_the_errors_that_encoders_do_not():
+def test_a_tracker_shows_the_errors_that_encoders_do_not(monkeypatch):
     still = recorded(2000)
     rng = np.random.default_rng(5)
     off = 1.2 * lasting(rng, 2000, 0.9)  # cables
@@ -148,6 +149,9 @@ def test_a_tracker_shows_the_errors_that_encoders_do_not():
     assert found.tip == nearly.tip
     with pytest.raises(BadInput, match="by the same number throughout"):
         calibrate_arm(replace(tracked, marker_mm=(marker - off) @ turn.T), name="ours")
+    monkeypatch.setattr(arm_calibration, "_FITS", 2)
+    with pytest.raises(BadInput, match="cannot be found from these samples"):
+        calibrate_arm(tracked, name="ours")
 
 
 def test_times_that_do_not_increase_are_refused():

@@ -61,6 +61,13 @@ def test_the_outer_bodies_stand_where_joints_and_base_put_them():
         assert np.abs(track.bodies_mm[:, :, 3:] - parts.end_mm[:, :-1]).max() < 0.05
 
 
+def test_where_a_base_moved_or_turned_no_bodies_are_placed(monkeypatch):
+    for spread in ({"spread_mm": 10.0}, {"spread_rad": 0.2}):
+        monkeypatch.setattr(Recording, "bases", tuple(replace(one, **spread) for one in two_arms(6.0).bases))
+        assert all(one.bodies_mm is None for one in timeline_of_recording(two_arms(6.0)).arms)
+        monkeypatch.undo()
+
+
 def test_a_demonstration_is_in_its_own_frame_with_its_recordings_times():
     recording = short()
     demo = cut_demo(recording, arm="PSM1", start_s=1.0, end_s=5.0)
