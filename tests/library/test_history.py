@@ -25,13 +25,15 @@ from skills.db.session import Database
 from skills.db.tiles import TILES, stored_tiles
 from skills.errors import BadSettings, Corrupt, NotReady
 from skills.library.operation import locks, sweep
-from skills.library.operation.history import Verified, sign_history, verify_history
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.history import Verified, edited_rows, sign_history, verify_history
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.proofs import first_head, served_at
 from skills.library.people import erasure
 from skills.library.people.erasure import erase_surgeon
 from skills.library.people.surgeons import find_surgeon, put_surgeon
 from skills.library.policies.releases import withdraw
+from skills.library.policies.versions import served_release
 from skills.library.recordings import content_cache, recordings
 from skills.library.recordings.recordings import stored_recording
 from skills.schemas.people import SurgeonIn
@@ -698,3 +700,20 @@ def test_a_head_that_cannot_be_kept_is_no_reason_to_stop(tmp_path: Path, caplog:
     assert "could not be appended" in caplog.text
     assert "SKILLS_CHECKPOINTS" in caplog.text
     assert os.listdir(tmp_path) == []
+
+
+def test_what_another_installation_sealed_is_served_once_it_is_signed(database: Database, tmp_path: Path):
+    """A backup brings leaves that the key of another installation sealed; they are signed when they are adopted."""
+    cases.add_demo(database)
+    policy = cases.train(database, release=True).sha256
+    back_up(database, tmp_path / "b.zip")
+    (place := tmp_path / "other").mkdir()
+    with closing(Database(backends.blank("sqlite", place), signing_key=tmp_path / "other.key")) as other:
+        restore(other, tmp_path / "b.zip")
+        with other.reading() as session:
+            assert served_release(session, "kestrel", cases.SUTURE).policy.sha256 == policy
+            keys = list(latest_leaves(session.connection(), "releases", ["1"]))
+            assert edited_rows(session.connection(), other.history, "releases", keys) == []
+        with tampering(other) as connection:
+            connection.execute(update(Release).values(released_by="somebody else"))
+            assert edited_rows(connection, other.history, "releases", keys) == keys == ["1"]
