@@ -110,8 +110,8 @@ def check_joints(topic: str, joints: Floats) -> None:
     """
     limits = np.where(np.array(UNITS) == "mm", COORDINATE_LIMIT_MM, _JOINT_RAD)
     six, limits = joints[:, : len(limits)], limits[: joints.shape[1]]  # a jaw may follow them
-    if len(six) and (np.maximum(six.max(axis=0), -six.min(axis=0)) > limits).any():
-        wrong = np.abs(six) > limits
+    wrong = ~(np.abs(six) <= limits)
+    if wrong.any():
         row, joint = np.argwhere(wrong)[0].tolist()
         raise NotMetres(
             f"{topic}: {JOINTS[joint]} is {joints[row, joint]:g} {UNITS[joint]} in sample {row}; no joint of a PSM is. "

@@ -451,18 +451,21 @@ class Decoder:
 
     def _by_shape(self, data: Bytes, begin: Ints, length: Ints) -> Iterator[tuple[Ints, Columns]]:
         """Yield the messages of each shape together: their indices and columns."""
-        # Usually all lengths are equal, and that is faster to find out than to sort them.
-        sizes = length[:1] if (length == length[0]).all() else np.unique(length)
-        for size in sizes.tolist():
-            left = np.flatnonzero(length == size) if len(sizes) > 1 else np.arange(len(length))
-            known = [shape for shape in self._shapes if shape.size == size]
-            while len(left):
-                first = int(begin[left[0]])
-                shape = known.pop(0) if known else self._shape(data[first : first + size].tobytes())
-                fits, taken = take(data, begin[left] - HEAD_BYTES, length[left], shape)
-                if len(taken):
-                    yield left[fits], shape.columns(taken)
-                left = left[~fits]
+        which, heads, known = np.arange(len(begin)), begin - HEAD_BYTES, list(self._shapes)
+        while len(which):
+            size, first = int(length[0]), int(heads[0]) + HEAD_BYTES
+            shape = next((one for one in known if one.size == size), None)
+            if shape is None:
+                shape = self._shape(data[first : first + size].tobytes())
+            else:
+                known.remove(shape)
+            fits, taken = take(data, heads, length, shape)
+            if len(taken) == len(which):  # usually, and then nothing is copied
+                yield which, shape.columns(taken)
+                return
+            if len(taken):
+                yield which[fits], shape.columns(taken)
+            which, heads, length = which[~fits], heads[~fits], length[~fits]
 
     def _shape(self, message: bytes) -> Shape:
         """Determine the shape of a message, and cache it."""
