@@ -38,7 +38,7 @@ define install
 	if command -v uv >/dev/null 2>&1; then \
 	  { uv venv -q --allow-existing --python $(PYTHON) $(VENV) || { $(NO_PYTHON); }; } && \
 	  $(SETUPTOOLS) | VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --require-hashes -r - && \
-	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip $(2) -q --compile-bytecode --require-hashes --no-build-isolation $(1) && \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip $(firstword $(2)) -q --compile-bytecode --require-hashes --no-build-isolation $(wordlist 2,2,$(2)) $(1) && \
 	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --no-deps --no-build-isolation -e . ; \
 	else \
 	  { $(IS_PYTHON) || { $(NO_PYTHON); }; } && \
