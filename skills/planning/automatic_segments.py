@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 
 from skills.planning.motion_laws import A1
-from skills.planning.trajectory import Trajectory
+from skills.planning.trajectory import Trajectory, stands_from
 
 SegmentKind = Literal["approach", "transfer", "A1", "A2", "hand-over"]
 HandTask = Literal["M1", "M2"]
@@ -29,7 +29,6 @@ BY_HAND: tuple[HandTask, ...] = (
     "M1",
     "M2",
 )  # before the first segment of the first pass, and before A1 of each further one
-STILL = 1e-9  # rad or mm; round-off of joints that stand
 
 
 @dataclass(frozen=True)
@@ -58,14 +57,14 @@ def segments_of(trajectory: Trajectory) -> list[AutomaticSegment]:
         begin, end = (along[0], along[-1]) if along else (first, first)
         before = BY_HAND
         if begin > first:
-            arrived = _stands_from(trajectory, first, begin)
+            arrived = max(first, stands_from(trajectory, begin))
             kind: SegmentKind = "transfer" if number else "approach"
             found.append(AutomaticSegment(kind, number, first, arrived, () if number else BY_HAND))
             before = BY_HAND if number else ()
         if end > begin:
             found.append(AutomaticSegment("A1", number, begin, end, before))
             before = ()
-        turned = _stands_from(trajectory, end, last) if _jaws_move(trajectory, end, last) else last
+        turned = max(end, stands_from(trajectory, last)) if _jaws_move(trajectory, end, last) else last
         if turned > end:
             found.append(AutomaticSegment("A2", number, end, turned, before))
         if last > turned:
@@ -77,10 +76,3 @@ def _jaws_move(trajectory: Trajectory, first: int, last: int) -> bool:
     """Return whether a jaw of either arm changes between two samples, as in a hand-over."""
     jaws = [arm.jaw_rad[first : last + 1] for arm in trajectory.arms if arm.jaw_rad is not None]
     return any((jaw != jaw[0]).any() for jaw in jaws)
-
-
-def _stands_from(trajectory: Trajectory, first: int, last: int) -> int:
-    """Return the first of some samples from which on no joint of either arm moves until the last one."""
-    steps = [np.abs(np.diff(arm.joints[first : last + 1], axis=0)).max(axis=1) for arm in trajectory.arms]
-    moving = np.flatnonzero(~(np.max(steps, axis=0) <= STILL)) if last > first else np.zeros(0, np.int64)
-    return int(first + moving[-1] + 1) if len(moving) else int(first)

@@ -59,6 +59,7 @@ _ATTEMPTS = 20
 Paces = tuple[motion_laws.Pace, motion_laws.Pace, motion_laws.Pace]  # of each phase
 
 
+STANDS = 1e-6  # ours, rad and mm: joints that differ by no more are those of one pose
 PSM_A, PSM_M = "PSM_A", "PSM_M"  # the names of the two arms: the one that hands over, and the one that takes
 
 
@@ -563,6 +564,20 @@ def rows_of_pass(trajectory: Trajectory, pass_index: int | None) -> Ints:
     if not 0 <= pass_index < trajectory.passes:
         raise BadPlan(f"The plan's passes are 0 to {trajectory.passes - 1}.", **{"pass": pass_index})
     return np.flatnonzero(trajectory.pass_index == pass_index)
+
+
+def stands_from(trajectory: Trajectory, end: int) -> int:
+    """Return the first of the samples up to an end at which both arms stand as they do there.
+
+    Args:
+        trajectory: The motion.
+        end: The index of a sample; NaN stands nowhere else.
+    """
+    moved = np.zeros(end + 1, bool)
+    for arm in trajectory.arms:
+        moved |= ~(np.abs(arm.joints[: end + 1] - arm.joints[end]) <= STANDS).all(axis=1)
+    moved[end] = False
+    return end - int(np.argmax(np.append(moved[::-1], True))) + 1
 
 
 def seconds_by_phase(trajectory: Trajectory) -> dict[str, float]:
