@@ -8,6 +8,7 @@ ReachIn --map_style--> Reach: at which suture points a style can be planned, not
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -25,6 +26,7 @@ from skills.learning.policy import Policy
 from skills.library.operation import locks
 from skills.library.operation.integrity import find_by_digest, learnt, plan_identity, planned
 from skills.library.plans.description import describe_plan
+from skills.library.plans.readings import readings
 from skills.library.policies import versions
 from skills.library.policies.combined import learnt_from
 from skills.library.recordings.recordings import Reader, Upload, read_upload
@@ -35,6 +37,7 @@ from skills.planning.trajectory import Trajectory, time_parametrise
 from skills.remedies import Action, Remedy
 from skills.schemas.plans import PlanIn, PsmMIn
 from skills.schemas.recordings import TableIn
+from skills.verification.reach import map_reach
 
 
 def find_suture_points(upload: Upload, arm: str | None, frame: str | None, read: Reader) -> SuturePoints:
@@ -53,6 +56,7 @@ def find_suture_points(upload: Upload, arm: str | None, frame: str | None, read:
     return suture_points(scene, arm=arm, frame=frame)
 
 
+DEEP_MM = 50.0  # ours: no suture is so deep in tissue
 LEAST_MM = 0.1  # ours: a speed (mm/s) or an offset below it was given in metres
 
 
@@ -68,9 +72,15 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         NoHandOff: The plan would have no hand-off, and such a plan was not requested.
     """
     style = style_of(database, request.surgeon, request.suture, request.version)
-    plan, sha = stacked(request, style), style.sha256
+    try:
+        plan, sha = stacked(request, style), style.sha256
+        about = describe_plan(plan, trajectory_of(plan), style.learnt_in)
+    except BadPlan as error:
+        meant = [words for words, other in readings(request) if fits(other, style)]
+        if meant:
+            error.remedies += (f"Read {', or '.join(meant)}, every pass is within reach and clear: is that meant?",)
+        raise
     identity = plan_identity(sha, plan)
-    about = describe_plan(plan, trajectory_of(plan), style.learnt_in)
     with database.writing([locks.surgeon(request.surgeon)]) as session:
         # Consent may have ended, or a demonstration been withdrawn, while the plan was computed.
         policy = versions.followable(versions.find_by_digest(session, sha))
@@ -85,6 +95,21 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         record_event(session, actor, "plan", "plan", identity, policy.surgeon)
         session.flush()
         return stored, True
+
+
+def fits(request: PlanIn, style: "FollowedStyle") -> bool:
+    """Return whether a plan can be made in which every pass is within reach and clear, in closed form."""
+    try:
+        plan = stacked(request, style)
+        trajectory_of(plan)
+        places = [
+            place
+            for one in plan.passes
+            for place in map_reach(replace(plan, passes=(one,)), np.array([one.point.position_mm]))
+        ]
+    except BadPlan:
+        return False
+    return all(place.reach != "no" for place in places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +167,24 @@ def stacked(request: PlanIn, style: FollowedStyle) -> SuturePlan:
         orientation=request.orientation,
         a2=request.a2,
     )
+    _refuse_centimetres(plan, request.tissue_mm)
     return replace(plan, scene=_scene(request, plan.frame, style.learnt_in))
+
+
+def _refuse_centimetres(plan: SuturePlan, tissue_mm: float | None) -> None:
+    """Refuse a height of tissue far above all of the motion that would be below it in centimetres.
+
+    Raises:
+        BadPlan: It is.
+    """
+    top_mm = max(float(one.tip_mm[:, 2].max()) for one in plan.passes)
+    if tissue_mm is not None and tissue_mm > top_mm + DEEP_MM and 10.0 * tissue_mm < top_mm:
+        raise BadPlan(
+            f"All of the motion is more than {tissue_mm - top_mm:.0f} mm below tissue at a height of {tissue_mm:g} mm; "
+            "this seems to be in centimetres.",
+            f"Give {10 * tissue_mm:g} mm.",
+            tissue_mm=tissue_mm,
+        )
 
 
 def _scene(request: PlanIn, frame: str, learnt_in: Scene | None) -> Scene | None:
