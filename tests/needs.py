@@ -77,6 +77,11 @@ NEEDS = {
     "simulator": Need(
         "PyBullet is", "it has a wheel for Python 3.11 on Linux, x86_64, only", lambda: find_spec("pybullet")
     ),
+    "meshes": Need(
+        "the manufacturer's meshes are",
+        "set SKILLS_TEST_MESHES to a checkout of jhu-dvrk/dvrk_model with its files in Git LFS",
+        lambda: _is_folder("SKILLS_TEST_MESHES"),
+    ),
     "fcl": Need("python-fcl is", "`make` installs the locked packages", lambda: find_spec("fcl")),
     "mujoco": Need("MuJoCo is", "`make` installs the locked packages", lambda: find_spec("mujoco")),
     "deep": Need("the extra `deep` is", "make deep", lambda: all(find_spec(name) for name in NEEDED)),

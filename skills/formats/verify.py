@@ -217,8 +217,10 @@ def _check_signature(archive: Archive, sums: dict[str, str], key: PublicKey | No
     """Check that the signature covers exactly the other files; return a sentence about it, and what was signed."""
     covered = {name: digest for name, digest in sums.items() if name != SIGNATURE}
     if SIGNATURE not in sums:
-        if key is not None:
-            raise BadBag(f"The bag has no {SIGNATURE}: it was removed. Export it again.")
+        if key is not None or SIGNATURE in archive.text(README):
+            raise BadBag(
+                f"The bag has no {SIGNATURE}, which {README} or the key demands: it was removed. Export it again."
+            )
         return f"UNSIGNED: it has no {SIGNATURE}, and anybody could have written it.", None
     try:
         envelope = read_envelope(archive.text(SIGNATURE).encode())
@@ -413,6 +415,8 @@ def _decoder(channel: Channel, schema: MessageSchema, said: _Topic) -> Decoder:
     expected = ("cdr", said.type, "ros2msg", DEFINITIONS[said.type].encode())
     if (channel.encoding, schema.name, schema.encoding, schema.definition) != expected:
         raise BadBag(f"{channel.topic} does not have the type {said.type}. Export the bag again.")
+    if (channel.qos, channel.publisher) != ("[]", ""):
+        raise BadBag(f"{channel.topic} offers another quality of service than is written. Export the bag again.")
     return Decoder(channel.topic, fields_of(schema.name, schema.definition.decode()), said.wanted)
 
 

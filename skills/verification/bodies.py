@@ -5,10 +5,11 @@
     Trajectory --bodies_clearance--> BodiesReport, and the least distance at every sample
     two arms as planned, variations --too_near--> which variations are
 
-Each body is a capsule: the points within a radius of a straight axis, so distances are exact and cost a microsecond per
-pose and arm. A link with a flat or an angular section is enclosed by the circle around it. Beside the bodies of the arm
-stand its shaft and its *hand*: wrist and fingers, whatever their opening. Two tools alone are compared with each other
-by the simulator and by `skills.verification.clearance`.
+Each body is enclosed by a capsule: the points within a radius of a straight axis, with distances at a microsecond per
+pose and arm. Where two capsules are near, a body with a published mesh counts as the smaller outline of that
+(`skills.verification.hulls`): of two lower bounds the greater one is taken. Beside the bodies of the arm stand its
+shaft and its *hand*: wrist and fingers, whatever their opening. Two tools alone are compared with each other by the
+simulator and by `skills.verification.clearance`.
 
 A remote-centre arm is a chain of few parts. Its *base* stands still. The *yaw link* turns about the base's y axis, by
 -yaw. The parallelogram turns within the yaw link: its levers, and the insertion axis parallel to them, by -pitch about
@@ -19,21 +20,20 @@ is
 
 and between two poses it moves no further than its greatest distances from both axes times the turns, plus the slide.
 
-**Sources, in mm.** Axes: the joints' origins in the URDF of jhu-dvrk/dvrk_model, urdf/Classic/PSM_base.urdf.xacro,
-urdf/Classic/SUJ.urdf.xacro and urdf/Si/PSM_base.urdf.xacro, from which the frames below are computed; remote centre and
-insertion as in `skills.kinematics`. Middles of the Classic's base, yaw link and insertion axis: the inertial offsets in
-WPI-AIM/ambf, blender-psm.yaml (572, 529 and 29 behind the remote centre; 43 and 61 below and 251 above it). Radii of
-the Si: half of the diagonal of the box that has the link's published moments of inertia, and `MARGIN_MM`. Radii of the
-Classic, and how far its base and yaw link reach: ours. The yaw link's radius is such that two arms whose axes are
-parallel, one turned by 35 degrees, are free at a distance of 261 and not at 241 (measured once on the manufacturer's
-bodies: free by 11 there, and overlapping). Setup joint's end, carriage, cannula and its mount: ours, generous. **None
-of them was compared with the manufacturer's meshes**: an arm may stand out of its bodies where neither a joint nor a
-moment of inertia shows it, such as with cables and drapes.
+**Sources, in mm.** Axes: the joints' origins in the URDF of jhu-dvrk/dvrk_model, urdf/Classic/PSM_base.urdf.xacro and
+urdf/Si/PSM_base.urdf.xacro, from which the frames below are computed; remote centre and insertion as in
+`skills.kinematics`. Capsules with an outline are the smallest around it; those of the Classic's levers and the Si's
+cannula are around the meshes, with `OUTLINE_MM` to spare. Setup joint's end and arm, the Si's carriage, the Classic's
+cannula and mount have no mesh there: ours, generous. Nothing is known of cables and drapes beyond `MARGIN_MM`: a
+laboratory with more adds it to the distance between the bases. `tests/verification/test_meshes.py` compares all bodies
+with the meshes.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import hypot
+from typing import Any
 
 import numpy as np
 
@@ -44,9 +44,9 @@ from skills.kinematics import CLASSIC, INSERTION, SI, WRIST_MM, axes_of, instrum
 from skills.planning.trajectory import PSM_A, PSM_M, PlannedArm, SampleMoment, Trajectory
 from skills.verification.clearance import FINGER_REACH_MM, SHAFT_RADIUS_MM, Links, way_mm
 from skills.verification.error_draws import Displaced
+from skills.verification.hulls import CLASSIC_OUTLINES, MARGIN_MM, OUTLINE_MM, SI_OUTLINES, hulls_apart
 from skills.verification.playback import CLEARANCE_SEEN_MM
 
-MARGIN_MM = 10.0  # ours: what each radius below is larger than the outline that it stands for, where one is known
 LOOK_MM = 10.0  # ours: distances are computed at samples between which no two bodies approach by more
 _CHUNK = 2000  # poses computed at once
 Row = tuple[float, float, float]
@@ -66,6 +66,9 @@ class ArmCapsule:
         end_turning_mm: What is added to the end, turning with the pitch.
         yaws: Whether it turns with the yaw; otherwise it stands still.
         slides: Whether it moves down with the insertion.
+
+    One whose ends turn alike is carried along without turning, unless it begins in the remote centre; another turns
+    about its beginning in the yaw link.
     """
 
     name: str
@@ -78,42 +81,40 @@ class ArmCapsule:
     slides: bool = False
 
 
-def _tool_side(adaptor_mm: float, behind_mm: float) -> tuple[ArmCapsule, ...]:
-    """Return what is alike on both arms; the column is `behind_mm` behind the tool."""
-    return (
-        ArmCapsule(
-            "carriage",
-            55.0,
-            turning_mm=(0, behind_mm / 4, adaptor_mm + 50),
-            end_turning_mm=(0, behind_mm / 4, adaptor_mm - 110),
-            slides=True,
-        ),
-        ArmCapsule("cannula mount", 30.0, turning_mm=(0, behind_mm, 70), end_turning_mm=(0, 0, 70)),
-        ArmCapsule("cannula", 12.0, turning_mm=(0, 0, 90), end_turning_mm=(0, 0, -10)),
-    )
-
-
 BODIES: Mapping[str, tuple[ArmCapsule, ...]] = {
     CLASSIC.name: (
         ArmCapsule("setup joint end", 90.0, (0, -910, -49.8), (0, -800, -49.8), yaws=False),
-        ArmCapsule("base", 85.0, (0, -780, -43), (0, -400, -43), yaws=False),
-        ArmCapsule("yaw link", 112.0, (0, -750, -60.7), (0, -400, -60.7)),
-        ArmCapsule("back lever", 50.0, (-29.5, -518.5, 0), (-29.5, -518.5, 0), end_turning_mm=(24.1, -42.1, 187)),
-        ArmCapsule("front lever", 50.0, (-29.5, -428.5, 0), (-29.5, -428.5, 0), end_turning_mm=(24.1, -42.1, 187)),
-        ArmCapsule("bars", 60.0, (-10, -518.5, 0), (-10, 1.5, 0), (0, -41.9, 168.5), (0, -41.9, 168.5)),
-        ArmCapsule("insertion axis", 60.0, turning_mm=(0, -40, 10), end_turning_mm=(0, -40, 500)),
-        *_tool_side(CLASSIC.remote_centre_mm, -40),
+        ArmCapsule("base", 102.0, (0, -709, -144), (0, -726, -2), yaws=False),
+        ArmCapsule("base plate", 72.0, (-40, -628, -131), (43, -629, -128), yaws=False),
+        ArmCapsule("base front", 68.0, (0, -531, -178), (0, -363, -45), yaws=False),
+        ArmCapsule("yaw link", 114.0, (1, -612, -39), (0, -446, -34)),
+        ArmCapsule("back lever", 20.0, (-29.5, -518.5, 0), (-29.5, -518.5, 0), (-6.5, -4.5, 0), (-5.5, -45.5, 188)),
+        ArmCapsule("front lever", 22.0, (-29.5, -428.5, 0), (-29.5, -428.5, 0), (0.5, 0.5, -1), (0.5, -41.5, 151)),
+        ArmCapsule("rear bar", 42.0, (2, -194.2, 17.9), (2, -512.2, 19.9), (0, -41.8, 150.1), (0, -41.8, 150.1)),
+        ArmCapsule("lower bar", 55.0, (2, -152.2, 0.9), (2, 0.8, 0.9), (0, -41.8, 150.1), (0, -41.8, 150.1)),
+        ArmCapsule("upper bar", 17.0, (3, -527.9, 0), (3, -205.9, 0), (0, -42.1, 187), (0, -42.1, 187)),
+        ArmCapsule("upper plate", 52.0, (3, -2.9, -1), (3, -164.9, -1), (0, -42.1, 187), (0, -42.1, 187)),
+        ArmCapsule("insertion axis", 50.0, turning_mm=(3, -41, 142), end_turning_mm=(4, -46, 552)),
+        ArmCapsule("carriage", 43.0, turning_mm=(0, -5, 354), end_turning_mm=(0, -8, 426), slides=True),
+        ArmCapsule("cannula mount", 51.0, turning_mm=(0, -17, 98), end_turning_mm=(3, -41, 134)),
+        ArmCapsule("cannula", 12.0, turning_mm=(0, 0, 90), end_turning_mm=(0, 0, -10)),
     ),
     SI.name: (
         ArmCapsule("setup joint end", 90.0, (0, -1090, 0), (0, -1000, 0), yaws=False),
-        ArmCapsule("base", 79.0, (0, -1001, 0), (0, -760, 0), yaws=False),
-        ArmCapsule("yaw link", 81.0, (-51.7, -712.8, 21.2), (-129.1, -365.3, -71.1)),
-        ArmCapsule("lever", 107.0, (0, -386.5, -71.2), (0, -386.5, -71.2), (0, -3.4, -47), (0, -138.4, 154)),
-        ArmCapsule("bars", 93.0, (0, -438.1, 7), (0, -46.2, 49.3), (0, -115.2, 171.6), (0, -115.2, 171.6)),
-        ArmCapsule("insertion axis", 49.0, turning_mm=(0, -66.7, 37.3), end_turning_mm=(0, -81.3, 578.9)),
-        *_tool_side(SI.remote_centre_mm, -74),
+        ArmCapsule("setup joint arm", 79.0, (0, -1001, 0), (0, -843, 0), yaws=False),
+        ArmCapsule("base", 70.0, (0, -703, 0), (0, -843, -1), yaws=False),
+        ArmCapsule("yaw link", 60.0, (-116, -630, 0), (-2, -658, 0)),
+        ArmCapsule("yaw arm", 61.0, (-109, -568, 0), (-98, -386, -71)),
+        ArmCapsule("lever", 108.0, (0, -386.5, -71.2), (0, -386.5, -71.2), (-3, -30.5, -5.8), (0, -120.5, 125.2)),
+        ArmCapsule("rear bar", 55.0, (0, -321.4, 78.2), (0, -385.4, -71.8), (0, -114.6, 167.8), (0, -114.6, 167.8)),
+        ArmCapsule("bars", 65.0, (0, -13.4, 1.2), (0, -310.4, 63.2), (0, -114.6, 167.8), (0, -114.6, 167.8)),
+        ArmCapsule("insertion axis", 47.0, turning_mm=(0, -94, 147), end_turning_mm=(0, -77, 563)),
+        ArmCapsule("carriage", 55.0, turning_mm=(0, -18.5, 532.6), end_turning_mm=(0, -18.5, 372.6), slides=True),
+        ArmCapsule("cannula mount", 52.0, turning_mm=(-1, -37, 92), end_turning_mm=(0, -77, 116)),
+        ArmCapsule("cannula", 18.0, turning_mm=(0, -8, 69), end_turning_mm=(0, -8, -5)),
     ),
 }
+OUTLINES = {CLASSIC.name: CLASSIC_OUTLINES, SI.name: SI_OUTLINES}
 TOOL = ("shaft", "hand")  # of every arm, after its bodies
 # Parts over the tissue. The others hang beside the table: tissue is a plane without an edge, and they may be below it.
 ABOVE_TISSUE = ("insertion axis", "carriage", "cannula mount", "cannula")
@@ -125,7 +126,11 @@ def names_of(instrument: str) -> tuple[str, ...]:
     Args:
         instrument: Number of the instrument.
     """
-    return tuple(body.name for body in _of(instrument)) + TOOL
+    return _names(instrument_of(instrument).arm.name)
+
+
+def _names(arm: str) -> tuple[str, ...]:
+    return tuple(body.name for body in BODIES[arm]) + TOOL
 
 
 def radii_of(instrument: str) -> Floats:
@@ -145,33 +150,107 @@ def _of(instrument: str) -> tuple[ArmCapsule, ...]:
     return BODIES[instrument_of(instrument).arm.name]
 
 
-def parts_of(joints: Floats, instrument: str) -> Links:
+@dataclass(frozen=True, eq=False)
+class _Moving:
+    """What moves of the B bodies of an arm: places (B, K, 3) in the yaw link, and (B, K, 3) turning with the pitch."""
+
+    at_mm: Floats
+    turning_mm: Floats
+    yaws: Flags
+    slides: Flags
+
+    def of(self, parts: Ints | slice, joints: Floats) -> Floats:
+        """Return points of parts in an arm's base frame, (T, B, K, 3), or (T, K, 3) with one part for each row.
+
+        Args:
+            parts: A slice, for all of these in each pose; or a part for each pose, shape (T,).
+            joints: The joints, shape (T, 6).
+        """
+        each = (slice(None), None) if isinstance(parts, slice) else (slice(None),)
+        yaw, pitch, slid = (joints[:, k][(*each, None)] for k in range(3))
+        fixed, swung = self.at_mm[parts], self.turning_mm[parts]
+        yaws, slides = self.yaws[parts, None], self.slides[parts, None]
+        (s1, s2), (c1, c2) = ((f(yaw), f(pitch)) for f in (np.sin, np.cos))
+        up = swung[..., 2] - np.where(slides, slid, 0.0)
+        y = fixed[..., 1] + c2 * swung[..., 1] + s2 * up
+        z = fixed[..., 2] - s2 * swung[..., 1] + c2 * up
+        x = fixed[..., 0] + swung[..., 0] + np.zeros_like(y)
+        turned = np.stack([c1 * x - s1 * z, y, s1 * x + c1 * z], axis=-1)
+        return np.where(yaws[..., None], turned, np.broadcast_to(fixed, turned.shape))
+
+
+@cache
+def _ends_of(arm: str) -> _Moving:
+    """Return both ends of the axes of an arm's bodies."""
+    names = (("begin_mm", "end_mm"), ("turning_mm", "end_turning_mm"), ("yaws",), ("slides",))
+    ends = [np.array([[getattr(body, name) for name in some] for body in BODIES[arm]]) for some in names]
+    return _Moving(ends[0].astype(float), ends[1].astype(float), ends[2][:, 0], ends[3][:, 0])
+
+
+@cache
+def _outlines_of(arm: str) -> tuple[_Moving, Flags]:
+    """Return the corners of the outlines of an arm's bodies, and which bodies have one."""
+    ends, found = _ends_of(arm), OUTLINES[arm]
+    longest = max(len(corners) for corners in found.values())
+    at, turning = (np.zeros((len(BODIES[arm]), longest, 3)) for _ in range(2))
+    for number, body in enumerate(BODIES[arm]):
+        if body.name in found:
+            corners = found[body.name][np.arange(longest) % len(found[body.name])]
+            hinged = body.turning_mm != body.end_turning_mm
+            at[number] = ends.at_mm[number, 0] if hinged else corners - ends.turning_mm[number, 0]
+            turning[number] = corners - at[number]
+    return _Moving(at, turning, ends.yaws, ends.slides), np.array([one in found for one in _names(arm)])
+
+
+@dataclass(frozen=True, eq=False)
+class Parts(Links):
+    """The axes of an arm's parts in T poses, with what is needed for the corners of their outlines.
+
+    Attributes:
+        joints: The joints, shape (T, 6).
+        instrument: Number of the instrument.
+        base: Rotation of the arm's base in the frame of the axes, shape (3, 3).
+        base_mm: Position of its remote centre there, shape (3,).
+    """
+
+    joints: Floats
+    instrument: str
+    base: Floats
+    base_mm: Floats
+
+    def seen_from(self, base: Floats, base_mm: Floats) -> "Parts":
+        """Return the parts in a frame where their own frame is at `base_mm`, shape (3,), turned by `base`, (3, 3)."""
+        links = super().seen_from(base, base_mm)
+        whole = base @ self.base, self.base_mm @ base.T + base_mm
+        return Parts(links.begin_mm, links.end_mm, self.joints, self.instrument, *whole)
+
+    def corners(self, rows: Ints, parts: Ints) -> tuple[Floats, Floats]:
+        """Return corners of N parts, (N, K, 3): of the outline, or the ends of the axis; and their radii, (N,)."""
+        moving, known = _outlines_of(instrument_of(self.instrument).arm.name)
+        ends = np.stack([self.begin_mm[rows, parts], self.end_mm[rows, parts]], axis=1)
+        corners = ends[:, np.arange(moving.at_mm.shape[1]) % 2]
+        has = known[parts]
+        corners[has] = moving.of(parts[has], self.joints[rows[has]]) @ self.base.T + self.base_mm
+        return corners, np.where(has, OUTLINE_MM, radii_of(self.instrument)[parts])
+
+
+def parts_of(joints: Floats, instrument: str) -> Parts:
     """Return the parts of an arm with these joints, in its base frame.
 
     Args:
         joints: Rows of `kinematics.JOINTS`, rad and mm, shape (T, 6). Limits are not checked; NaN stays NaN.
         instrument: Number of the instrument.
     """
-    bodies, tool = _of(instrument), instrument_of(instrument)
-    yaw, pitch, slid = (joints[:, k, None] for k in range(3))
-    (s1, s2), (c1, c2) = ((f(yaw), f(pitch)) for f in (np.sin, np.cos))
-    yaws, slides = (np.array([getattr(body, name) for body in bodies]) for name in ("yaws", "slides"))
-    ends = []
-    for at, turning in (("begin_mm", "turning_mm"), ("end_mm", "end_turning_mm")):
-        fixed, swung = (np.array([getattr(body, name) for body in bodies], float) for name in (at, turning))
-        up = swung[:, 2] - np.where(slides, slid, 0.0)
-        y = fixed[:, 1] + c2 * swung[:, 1] + s2 * up
-        z = fixed[:, 2] - s2 * swung[:, 1] + c2 * up
-        x = fixed[:, 0] + swung[:, 0] + np.zeros_like(y)
-        turned = np.stack([c1 * x - s1 * z, y, s1 * x + c1 * z], axis=2)
-        ends.append(np.where(yaws[:, None], turned, np.broadcast_to(fixed, turned.shape)))
+    tool = instrument_of(instrument)
+    ends = _ends_of(tool.arm.name).of(slice(None), joints)
     shaft, hand, _ = axes_of(joints)
-    wrist = (slid - tool.wrist_offset_mm) * shaft
-    begin = np.concatenate([ends[0], np.stack([wrist - tool.shaft_mm * shaft, wrist], axis=1)], axis=1)
-    return Links(begin, np.concatenate([ends[1], np.stack([wrist, wrist + WRIST_MM * hand], axis=1)], axis=1))
+    wrist = (joints[:, INSERTION, None] - tool.wrist_offset_mm) * shaft
+    begin = np.concatenate([ends[:, :, 0], np.stack([wrist - tool.shaft_mm * shaft, wrist], axis=1)], axis=1)
+    end = np.concatenate([ends[:, :, 1], np.stack([wrist, wrist + WRIST_MM * hand], axis=1)], axis=1)
+    return Parts(begin, end, joints, instrument, np.eye(3), np.zeros(3))
 
 
-def placed(arm: PlannedArm, joints: Floats) -> Links:
+def placed(arm: PlannedArm, joints: Floats) -> Parts:
     """Return the parts of an arm of a trajectory with these joints, in PSM_A's base frame.
 
     Args:
@@ -215,14 +294,15 @@ def _reach(body: ArmCapsule, insertion_mm: float) -> Row:
     return wide, 0.0 if swung == 0 else swung + (0.0 if parallel else body.radius_mm), float(body.slides)
 
 
-def between(arm: Links, radii: Floats, other: Links, other_radii: Floats) -> Floats:
-    """Return the distances of all parts of one arm from all of another in as many poses, in one frame.
+def between(arm: Parts, other: Parts, within_mm: float = LOOK_MM) -> Floats:
+    """Return lower bounds on the distances of all parts of one arm from all of another in as many poses, in one frame.
+
+    They are those of the capsules, or below `within_mm` those of the outlines if they are greater.
 
     Args:
         arm: The parts of one arm, B in T poses.
-        radii: Their radii in mm, shape (B,).
         other: The parts of the other arm, C in T poses, in the same frame.
-        other_radii: Their radii in mm, shape (C,).
+        within_mm: Where capsules are further apart, nothing else is computed.
 
     Returns:
         Distances in mm, negative where they overlap, shape (T, B, C); infinite between the two tools.
@@ -233,9 +313,19 @@ def between(arm: Links, radii: Floats, other: Links, other_radii: Floats) -> Flo
         other.begin_mm[:, None],
         (other.end_mm - other.begin_mm)[:, None],
     )
-    apart -= radii[:, None] + other_radii
+    apart -= radii_of(arm.instrument)[:, None] + radii_of(other.instrument)
     apart[:, -len(TOOL) :, -len(TOOL) :] = np.inf
+    row, part, its = np.nonzero(apart < within_mm)
+    for some in np.array_split(np.arange(len(row)), 1 + len(row) // _CHUNK):
+        at = row[some], part[some], its[some]
+        apart[at] = np.maximum(apart[at], _outlines_apart(arm.corners(*at[:2]), other.corners(at[0], at[2]), within_mm))
     return apart
+
+
+def _outlines_apart(corners: tuple[Floats, Floats], others: tuple[Floats, Floats], within_mm: float) -> Floats:
+    """Return lower bounds on the distances of N parts from N others, both with their corners and radii, as `Parts`."""
+    radii = corners[1] + others[1]
+    return hulls_apart(corners[0], others[0], within_mm + float(radii.max(initial=0.0))) - radii
 
 
 # ---- along a motion ------------------------------------------------------------------------------------------------
@@ -273,8 +363,8 @@ class BodiesReport:
         seen_within_mm: Pairs that are further apart throughout are not listed.
         looks: Number of samples at which distances were computed.
         nearest: The least distance of each pair of parts, the least first.
-        margin_mm: What the bodies are larger than the outlines that they stand for, where those are known.
-        compared_with_meshes: Whether they were compared with the manufacturer's meshes.
+        margin_mm: What the bodies are larger than the manufacturer's meshes, at least.
+        compared_with_meshes: Whether they were compared with those.
     """
 
     arms: tuple[str, ...]
@@ -284,7 +374,7 @@ class BodiesReport:
     looks: Count
     nearest: tuple[NearestBodies, ...]
     margin_mm: float = MARGIN_MM
-    compared_with_meshes: bool = False
+    compared_with_meshes: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +405,8 @@ def bodies_clearance(trajectory: Trajectory, limit_mm: float) -> BodiesClearance
         return BodiesClearance(alone, np.full(count, np.inf), None)
     ways = [way_mm(moved_mm(arm.joints[:-1], arm.joints[1:], arm.instrument)) for arm in arms]
     looks = _looks(ways)
-    seen = distances_at(trajectory, looks)
+    within_mm = limit_mm + LOOK_MM
+    seen = distances_at(trajectory, looks, within_mm)
     while True:
         bound = _until_next(seen, [way[looks] for way in ways])
         # Up to the first look that is too near, every gap in which the bound is broken is halved.
@@ -327,7 +418,7 @@ def bodies_clearance(trajectory: Trajectory, limit_mm: float) -> BodiesClearance
             break
         more = (looks[gaps] + looks[gaps + 1]) // 2
         at = np.searchsorted(looks, more)
-        looks, seen = np.insert(looks, at, more), np.insert(seen, at, distances_at(trajectory, more), axis=0)
+        looks, seen = np.insert(looks, at, more), np.insert(seen, at, distances_at(trajectory, more, within_mm), axis=0)
     at_least = np.full(count, np.inf)
     at_least[looks] = bound
     broken = ~(bound >= limit_mm)
@@ -354,21 +445,21 @@ def _looks(ways: list[Floats]) -> Ints:
     return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(steps) > 0), [len(gone) - 1]]))
 
 
-def distances_at(trajectory: Trajectory, at: Ints) -> Floats:
+def distances_at(trajectory: Trajectory, at: Ints, within_mm: float = LOOK_MM) -> Floats:
     """Return the distances of all parts of one arm from all of the other at some samples.
 
     Args:
         trajectory: A motion of both arms.
         at: The samples, shape (C,).
+        within_mm: As for `between`.
 
     Returns:
         Distances in mm, as of `between`, shape (C, B, B').
     """
     arms, found = trajectory.arms, []
-    radii = [radii_of(arm.instrument) for arm in arms]
     for some in np.array_split(at, 1 + len(at) // _CHUNK):
         arm, other = (placed(one, one.joints[some]) for one in arms)
-        found.append(between(arm, radii[0], other, radii[1]))
+        found.append(between(arm, other, within_mm))
     return np.concatenate(found)
 
 
@@ -428,7 +519,7 @@ def too_near(
     samples, count = len(arms[0].joints), wanted.shape[1]
     radii, centre = [radii_of(arm.instrument) for arm in arms], arms[1].base_mm
     planned = [placed(arm, arm.joints) for arm in arms]
-    apart = between(planned[0], radii[0], planned[1], radii[1])
+    apart = between(planned[0], planned[1], limit_mm)
     shapes = [one.reshape(count, samples, 6) for one in joints]
     moves = [moved_mm(arm.joints, q, arm.instrument) for arm, q in zip(arms, shapes, strict=True)]
     way = moves[0][..., :, None] + moves[1][..., None, :]
@@ -447,20 +538,25 @@ def too_near(
         which, part, other = np.nonzero(doubtful)
         if len(which):
             variation, sample = variations[which], at[which]
-            row, turn = variation * samples + sample, errors.base_turn[variation]
-            p, u = _axes(arms[0], joints[0], row, part)
-            q, v = _axes(arms[1], joints[1], row, other)
-            q, v = (np.einsum("kij,kj->ki", turn, one) for one in (q - centre, v))
-            q = q + centre + errors.base_mm[variation] + errors.tip_mm[1, variation, sample]
-            p = p + errors.tip_mm[0, variation, sample]
-            found = segments_apart(p, u, q, v) - radii[0][part] - radii[1][other]
+            used, row = np.unique(variation * samples + sample, return_inverse=True)
+            two = [placed(arm, q[used]) for arm, q in zip(arms, joints, strict=True)]
+            aside = (
+                errors.base_mm[variation] + errors.tip_mm[1, variation, sample] - errors.tip_mm[0, variation, sample]
+            )
+
+            def moved(
+                q: Floats, some: Any = ..., aside: Floats = aside, turn: Floats = errors.base_turn[variation]
+            ) -> Floats:
+                """Return points of PSM_M, (N, K, 3), as it is displaced from PSM_A in its variation."""
+                return np.asarray(np.einsum("kij,klj->kli", turn[some], q - centre) + centre + aside[some][:, None])
+
+            p, u = two[0].begin_mm[row, part], two[0].end_mm[row, part]
+            q, v = np.moveaxis(moved(np.stack([two[1].begin_mm[row, other], two[1].end_mm[row, other]], axis=1)), 1, 0)
+            found = segments_apart(p, u - p, q, v - q) - radii[0][part] - radii[1][other]
+            close = np.flatnonzero(found < limit_mm)
+            mine, (others, theirs) = (
+                one.corners(row[close], number[close]) for one, number in zip(two, (part, other), strict=True)
+            )
+            found[close] = np.maximum(found[close], _outlines_apart(mine, (moved(others, close), theirs), limit_mm))
             wrong[number] |= np.bincount(variation[~(found >= limit_mm)], minlength=count) > 0
     return wrong
-
-
-def _axes(arm: PlannedArm, joints: Floats, rows: Ints, parts: Ints) -> tuple[Floats, Floats]:
-    """Return beginning and direction of some parts in some poses, both of shape (K, 3)."""
-    used, index = np.unique(rows, return_inverse=True)
-    of_arm = placed(arm, joints[used])
-    begin = of_arm.begin_mm[index, parts]
-    return begin, of_arm.end_mm[index, parts] - begin

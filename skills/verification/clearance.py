@@ -249,6 +249,17 @@ def clearance_between(arm: Links, other: Links) -> Floats:
     return np.asarray(_between(p, u, q, v) - (RADII_MM[:, None] + RADII_MM))
 
 
+def lines_apart(points_mm: Floats, arm: Links) -> Floats:
+    """Return the least distances of a polyline in each pose from the links of an arm, shape (T, 4).
+
+    Args:
+        points_mm: Its points, shape (T, P, 3).
+        arm: The arm in T poses, in the same frame.
+    """
+    apart = _between(points_mm[:, :-1], np.diff(points_mm, axis=1), arm.begin_mm, arm.end_mm - arm.begin_mm)
+    return np.asarray(apart.min(axis=1) - RADII_MM)
+
+
 def _between(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
     """Return the distance of every segment p + s u from every segment q + t v, s and t in 0..1, shape (T, P, Q).
 
@@ -288,7 +299,7 @@ def needle_poses(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
         3, 3).
     """
     place, rotation = needle_in_psm_a(trajectory, at)
-    away = (trajectory.phase[at] == TRANSFER) & (trajectory.pass_index[at] > 0)
+    away = by_psm_m(trajectory)[at]
     if trajectory.psm_m is None or not away.any():
         return place, rotation
     taken = trajectory.last_samples[trajectory.pass_index[at[away]] - 1]
@@ -300,8 +311,13 @@ def needle_poses(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
     return place, rotation
 
 
+def by_psm_m(trajectory: Trajectory) -> Flags:
+    """Mark the samples, (T,), at which PSM_M holds the needle, or the surgeon: transfers to a further pass."""
+    return np.asarray((trajectory.phase == TRANSFER) & (trajectory.pass_index > 0))
+
+
 def needle_arc_mm(trajectory: Trajectory, at: Ints) -> Floats:
-    """Return points along the needle's wire in PSM_A's jaws at some samples.
+    """Return points along the needle's wire at some samples; it is at most `NEEDLE_REACH_MM` from their chords.
 
     Args:
         trajectory: The trajectory.
@@ -310,12 +326,12 @@ def needle_arc_mm(trajectory: Trajectory, at: Ints) -> Floats:
     Returns:
         Points in mm in the PSM_A base frame, shape (F, 49, 3).
     """
-    place, rotation = needle_in_psm_a(trajectory, at)
+    place, rotation = needle_poses(trajectory, at)
     return np.asarray(place[:, None] + np.einsum("fij,kj->fki", rotation, ARC_MM))
 
 
 def needle_travel_mm(trajectory: Trajectory) -> Floats:
-    """Return upper bounds on the distance that any point of the needle in PSM_A's jaws moves to the next sample.
+    """Return upper bounds on the distance that any point of the needle moves to the next sample.
 
     Args:
         trajectory: The trajectory, of T samples.
@@ -323,12 +339,15 @@ def needle_travel_mm(trajectory: Trajectory) -> Floats:
     Returns:
         Millimetres, shape (T - 1,).
     """
-    tool, moved = instrument_of(trajectory.instrument), np.abs(np.diff(trajectory.joints, axis=0))
-    wrist = np.abs(trajectory.joints[:, INSERTION] - tool.wrist_offset_mm)
     reach = float(np.hypot(HELD_MM, np.linalg.norm(ARC_MM, axis=1).max()) + RADIUS_MM)
-    deep = np.maximum(wrist[1:], wrist[:-1]) + WRIST_MM + reach
-    turned = (moved[:, 0] + moved[:, 1]) * deep + (moved[:, 3] + moved[:, 4]) * (WRIST_MM + reach)
-    return np.asarray(turned + moved[:, 2] + moved[:, 5] * reach)
+    travels = []
+    for arm in trajectory.arms:
+        moved = np.abs(np.diff(arm.joints, axis=0))
+        wrist = np.abs(arm.joints[:, INSERTION] - instrument_of(arm.instrument).wrist_offset_mm)
+        deep = np.maximum(wrist[1:], wrist[:-1]) + WRIST_MM + reach
+        turned = (moved[:, 0] + moved[:, 1]) * deep + (moved[:, 3] + moved[:, 4]) * (WRIST_MM + reach)
+        travels.append(turned + moved[:, 2] + moved[:, 5] * reach)
+    return np.asarray(np.where(by_psm_m(trajectory)[1:], travels[-1], travels[0]))
 
 
 def needle_to_pad_mm(trajectory: Trajectory, at: Ints, pad_mm: Floats) -> Floats:
@@ -339,9 +358,7 @@ def needle_to_pad_mm(trajectory: Trajectory, at: Ints, pad_mm: Floats) -> Floats
         at: The samples, shape (F,).
         pad_mm: The middle of the pad's top in the PSM_A base frame, shape (3,).
     """
-    place, rotation = needle_poses(trajectory, at)
-    arc = place[:, None] + np.einsum("fij,kj->fki", rotation, ARC_MM)
-    half = pad_scale(trajectory.tip_mm) * np.array(PAD_SIZE_MM) / 2
+    arc, half = needle_arc_mm(trajectory, at), pad_scale(trajectory.tip_mm) * np.array(PAD_SIZE_MM) / 2
     beyond = np.abs(arc - pad_mm + [0.0, 0.0, half[2]]) - half  # signed distance from each pair of the pad's faces
     outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=2)
     inside = np.minimum(beyond.max(axis=2), 0.0)
@@ -376,6 +393,7 @@ def needle_in_psm_a(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
 
 
 NEEDLE_THICK_MM = 2 * RADIUS_MM
+NEEDLE_REACH_MM = RADIUS_MM + ARC_BULGE_MM
 _HALF_WIDTH_RAD = FINGER_RADIUS_MM / NEEDLE_RADIUS_MM  # of the arc, from the middle of the fingers to their side
 
 

@@ -25,6 +25,11 @@ from skills.verification.scene_clearance import SceneClearance
 
 TOLERANCE = 1e-9  # in the unit of a figure: two processors differ by less, so both accept or one is too strict
 ROUND_OFF = 2e-9  # rad and mm: a joint may be as far beyond its limit as `inverse` allows, 1e-9
+# One count of the encoders of a PSM, rad and mm, from the gear ratios in the configuration generator of the dVRK's
+# controller: 14400 x 56.5 counts a turn (yaw, pitch), 14400 x 336.6 for 360 x 17.4533 mm, 4000 x 11.71 a turn (wrist).
+COUNT = np.array([7.72e-6, 7.72e-6, 1.296e-3, *[1.341e-4] * 3])
+JOLT_S = 0.01  # ours: a wave of 50 Hz turns from one such step to the next
+NEEDLE_TO_ARM = "distance of the needle from the other arm"
 SCENE = "clearance of the scene"  # the quantity of a failure beside tissue or an obstacle
 
 
@@ -33,7 +38,9 @@ class ArmSamples:
     """The joints of one arm, each array of shape (T, 6).
 
     `joints` are in rad and mm, `margins` are parts of the joints' ranges, `speed` and `acceleration` are parts of their
-    limits.
+    limits; `jerk` is the change of acceleration in `JOLT_S`, as a part of the same limit. `jolt` is the amplitude of a
+    wave of 50 Hz in five samples `JOLT_S` apart: a sixteenth of their fourth difference, which is 0 of every cubic, in
+    counts of the encoder, at the last of the five.
     """
 
     name: str
@@ -42,6 +49,8 @@ class ArmSamples:
     margins: Floats
     speed: Floats
     acceleration: Floats
+    jerk: Floats
+    jolt: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +63,7 @@ class Figures:
         fk_deg: The same for its rotation.
         psm_m_fk_mm: The same for PSM_M's tip, shape (T,); 0 where it was not measured or is not in the scene.
         ticks: Time since the previous sample, in sampling periods, shape (T,); 1 at the first.
+        unit: How far quaternions of the motion are from length 1, shape (T,); that of PSM_M's base is at the first.
         effort: The largest of the motors' efforts, as a part of its limit, shape (T,).
         apart: Lower bounds on the distances of each pair of links: measured, or bounded from measurements.
         needle_mm: Distance of the needle from the pad at the samples of `Playback.looked_at`, shape (C,).
@@ -64,6 +74,7 @@ class Figures:
     fk_deg: Floats
     psm_m_fk_mm: Floats
     ticks: Floats
+    unit: Floats
     effort: Floats
     apart: clearance.Bounds
     needle_mm: Floats
@@ -91,6 +102,7 @@ def figures_of(playback: Playback, trajectory: Trajectory) -> Figures:
         fk_deg=_rotation_error_deg(playback.rotation_xyzw, trajectory.rotation_xyzw),
         psm_m_fk_mm=psm_m_fk_mm,
         ticks=np.append(1.0, np.diff(trajectory.stamps_s) * trajectory.rate_hz),
+        unit=_off_unit(trajectory),
         effort=(np.abs(playback.efforts) / np.array(kinematics.instrument_of(trajectory.instrument).arm.effort)).max(
             axis=1
         ),
@@ -108,7 +120,26 @@ def _arm(name: str, joints: Floats, instrument: str, rate_hz: float) -> ArmSampl
     tool = kinematics.instrument_of(instrument)
     speed, acceleration = joint_ratios(joints, np.zeros(len(joints), np.int64), rate_hz, instrument)
     margins = kinematics.joint_margins(joints, instrument) / (tool.upper - tool.lower)
-    return ArmSamples(name, tool, joints, margins, speed, acceleration)
+    step = max(1, round(JOLT_S * rate_hz))
+    third, fourth = (_differences(joints, step, order) for order in (3, 4))
+    jerk = third * (rate_hz / step) ** 3 * JOLT_S / tool.acceleration[:6]
+    return ArmSamples(name, tool, joints, margins, speed, acceleration, jerk, fourth / 16 / COUNT)
+
+
+def _differences(joints: Floats, step: int, order: int) -> Floats:
+    """Return the absolute differences of joints so many samples apart, (T, 6), each at its last sample; 0 before."""
+    found = joints
+    for _ in range(order):
+        found = found[step:] - found[:-step]
+    return np.concatenate([np.zeros((len(joints) - len(found), 6)), np.abs(found)])
+
+
+def _off_unit(trajectory: Trajectory) -> Floats:
+    """Return how far the lengths of a motion's quaternions are from 1, shape (T,)."""
+    off = np.abs(np.linalg.norm(trajectory.rotation_xyzw, axis=1) - 1.0)
+    if trajectory.psm_m is not None:
+        off[0] = np.maximum(off[0], abs(np.linalg.norm(trajectory.psm_m.base_xyzw) - 1.0))
+    return np.asarray(off)
 
 
 def _rotation_error_deg(measured: Floats, meant: Floats) -> Floats:
@@ -134,6 +165,10 @@ class Limits:
             the tool's the insertion that puts the wrist at the same depth counts.
         speed_ratio: Greatest joint speed as a part of its limit; a millionth is left for round-off.
         acceleration_ratio: Greatest joint acceleration as a part of its limit; the same.
+        jerk_ratio: Greatest change of a joint's acceleration in 0.01 s, as a part of its limit. A hand that is averaged
+            over a quarter of a second by a Hann window changes by 16 times its own acceleration per second, 0.16, and
+            what is averaged may be twice what is left.
+        jolt_counts: Greatest amplitude of a vibration of 50 Hz, in counts of the joint's encoder: the arm sees no less.
         tracking_mm: Greatest servo error; the simulator's own is under 0.001 mm, and in contact it is millimetres.
         goal_mm: Greatest servo error at the end of each pass.
         alignment_deg: Greatest error of the jaw's rotation at the end of each pass.
@@ -153,6 +188,8 @@ class Limits:
     insertion_mm: float = kinematics.CANNULA_MM
     speed_ratio: float = 1.000001
     acceleration_ratio: float = 1.000001
+    jerk_ratio: float = 0.32
+    jolt_counts: float = 1.0
     tracking_mm: float = 0.1
     goal_mm: float = 0.05
     alignment_deg: float = 0.1
@@ -225,6 +262,7 @@ def first_failure(
     beside: SceneClearance | None = None,
     outer: BodiesClearance | None = None,
     intent: Deviations | None = None,
+    needle_mm: Floats | None = None,
 ) -> Failure | None:
     """Return the earliest sample at which a gate is broken; of several gates broken there, the first listed.
 
@@ -236,6 +274,7 @@ def first_failure(
         beside: The motion's distances from a scene; None: they are no gate.
         outer: The distances of the arms' outer bodies; None: they are no gate.
         intent: The motion's deviations from what was asked; None: they are no gate.
+        needle_mm: The needle's distance from the arm that does not hold it, shape (T,); None: it is no gate.
 
     Returns:
         The failure, or None if every sample passes every gate.
@@ -247,6 +286,8 @@ def first_failure(
     if beside is not None:
         gates.append(_Gate(SCENE, "mm", beside.at_least_mm, beside.report.limit_mm, at_least=True))
         gates.append(_Gate("distance of the needle from the tissue", "mm", beside.needle_mm, 0.0, at_least=True))
+    if needle_mm is not None:
+        gates.append(_Gate(NEEDLE_TO_ARM, "mm", needle_mm, limits.clearance_psm_m_mm, at_least=True))
     if intent is not None:
         gates += [_Gate(kind, LIMITS[kind][0], values, LIMITS[kind][1]) for kind, values in intent.values.items()]
     broken = [(sample, gate) for gate in gates if (sample := gate.broken()) is not None]
@@ -271,6 +312,7 @@ def first_failure(
 def _gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:
     """Yield the gates of a playback; of several that are broken at one sample, the first is reported."""
     yield _Gate("time since the sample before", "samples", figures.ticks, 1 - 1e-6, at_least=True)
+    yield _Gate("length of a quaternion off 1", "", figures.unit, 1e-6)
     for arm in figures.arms:
         yield from _joint_gates(arm, limits)
     yield _Gate("tip off the closed form", "mm", figures.fk_mm, limits.fk_mm)
@@ -306,6 +348,8 @@ def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
         yield _Gate(f"speed of {prefix}{name}", "of its limit", arm.speed[:, joint], limits.speed_ratio)
         accelerations = arm.acceleration[:, joint]
         yield _Gate(f"acceleration of {prefix}{name}", "of its limit", accelerations, limits.acceleration_ratio)
+        yield _Gate(f"jerk of {prefix}{name}", "of the acceleration", arm.jerk[:, joint], limits.jerk_ratio)
+        yield _Gate(f"jolt of {prefix}{name}", "encoder counts", arm.jolt[:, joint], limits.jolt_counts)
 
 
 def _clearance_gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:

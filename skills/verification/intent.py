@@ -9,9 +9,9 @@ planning computed (`skills.verification.requested`). The poses are those of the 
 * *Place.* The tip, moved back into the grid world of its suture point, goes through the cells of the policy's rollout
   in their order, from the start of the pass, and ends at the suture point.
 * *Recording.* From where the rollout follows the demonstration, A1 repeats it on the demonstration's clock, slowed by
-  one factor. The hand's samples within `HALF_S` of a moment lie within some distance of their mean; the tip may be that
-  far from the mean and a part of a cell further. The same holds of the jaw's rotation and opening. Where the hand
-  stood, an arm may stand; elsewhere it may not.
+  one factor. The tip may be as far off the mean of a quarter of a second around a moment as the hand's own samples lie
+  off a steady motion there, as far again as hysteresis let the recording's ends leave their cells, and a part of a cell
+  further; jaw and opening likewise. Where the hand stood, an arm may stand; elsewhere it may not.
 * *Hand-off.* At the end of A2 the needle is where the definition of the hand-off puts it: in the recorded poses of both
   arms, or with PSM_A's hinge along PSM_M's approach and PSM_M a quarter of the needle's circle further on.
 * *Jaws.* The needle is always held. PSM_A's jaw is as recorded, or closed, from the start of A1 until both arms stand
@@ -31,7 +31,7 @@ from skills.arrays import Floats
 from skills.kinematics import angle_between, forward, matrix_of
 from skills.planning.motion_laws import Poses
 from skills.planning.trajectory import Trajectory
-from skills.verification.deviations import Deviations
+from skills.verification.deviations import LIMITS, Deviations
 from skills.verification.pass_comparison import PassComparison, PlayedMotion
 from skills.verification.requested import RequestedMotion
 
@@ -48,6 +48,12 @@ def compare(request: RequestedMotion, trajectory: Trajectory, joints: Floats | N
     counted = np.maximum(trajectory.pass_index + 1 - len(request.points), 0).astype(np.float64)
     counted[-1] = abs(trajectory.passes - len(request.points))
     found.add("number of passes off the suture points", np.arange(len(trajectory)), counted)
+    stated = [np.array(point.rotation_xyzw) for point in request.points]
+    if (psm_m := request.psm_m) is not None:
+        stated += [np.array(one) for one in (psm_m.base_xyzw, psm_m.taken_xyzw) if one is not None]
+    first = np.zeros(1, np.int64)
+    found.add("length of a stated quaternion off 1", first, np.abs(np.linalg.norm(stated, axis=1) - 1.0).max())
+    found.add("PSM_M's approach off the demonstrated hand-off", first, _approach_deg(request))
     arm = _poses(trajectory.joints if joints is None else joints, trajectory.instrument)
     played = PlayedMotion(trajectory, arm, _place_psm_m(request, trajectory, found))
     before = None
@@ -55,6 +61,21 @@ def compare(request: RequestedMotion, trajectory: Trajectory, joints: Floats | N
         before = PassComparison(request, played, number, before, found)
         before.compare()
     return Deviations(MappingProxyType(found.values))
+
+
+def _approach_deg(request: RequestedMotion) -> float:
+    """Return the angle of PSM_M's approach from the demonstrated hand-off, if it fits that in PSM_M's frame; or else 0.
+
+    It is compared with the recorded approach, or with the needle, which then runs along it in PSM_A's jaws, to and fro.
+    """
+    psm_m, demo = request.psm_m, request.demo
+    if psm_m is None or psm_m.base_xyzw is None or demo is None or demo.rotation_xyzw is None:
+        return 0.0
+    known = demo.partner is not None
+    seen = demo.partner.approach if demo.partner is not None else matrix_of(demo.rotation_xyzw[-1:])[0, :, 0]
+    along = [one @ seen for one in (request.approach, matrix_of(np.array([psm_m.base_xyzw]))[0] @ request.approach)]
+    as_stated, in_its_own = np.degrees(np.arccos(np.clip(along if known else np.abs(along), -1.0, 1.0))).tolist()
+    return float(as_stated) if in_its_own <= LIMITS["PSM_M's approach off the demonstrated hand-off"][1] else 0.0
 
 
 def _place_psm_m(request: RequestedMotion, trajectory: Trajectory, found: Deviations) -> Poses | None:

@@ -26,6 +26,7 @@ STILL = 0.002  # of the greatest speed of a pass: an arm below it stands
 STAND_S = 0.25  # ours: so long it may, where the hand did not: more than a stroke needs to turn round
 BETWEEN_SHARE = 0.025  # of a phase: at both ends a minimum-jerk move is below `STILL` of its peak for 0.0113 of it
 CELL_STEP = 0.1  # of a cell: between two places whose cells are compared
+NEAR_CELL = 0.75  # of a cell: so near a place is to a cell by which it may go on to others
 _LEAST_MM = 1e-4  # of a step: below it a pass has no greatest speed
 _PAIRS = (("PSM_A", "PSM_M"), ("PSM_M", "PSM_A"))
 _FLIPPED = np.diag([-1.0, -1.0, 1.0])  # jaws are symmetric about their approach
@@ -162,8 +163,15 @@ class PassComparison:
         passed_s = self.motion.stamps_s[a1] - self.motion.stamps_s[a1[0]]
         clock_s, joined_s, firm_s = self._clock(states, passed_s)
         at, firm = hand.index(clock_s), ~(clock_s < firm_s)
-        off_mm = _far_mm(self.in_grid(self.arm.tip_mm[a1]), hand.tip_mm[at]) - hand.tip_spread_mm[at]
-        self.put("path off the recording", a1, np.where(firm, np.maximum(off_mm, 0.0) / cell_mm, 0.0))
+        # a path that joins later goes over to the recording over the length of a cell
+        way = lengths_along(hand.tip_mm)
+        joined = firm & ~(way[at] - way[hand.index(np.array(joined_s))] < cell_mm * (joined_s > -np.inf))
+        places = self.in_grid(self.arm.tip_mm[a1])
+        off_mm = hand.off_mm(places, at) - self._moved_mm(hand, at)
+        self.put("path off the recording", a1, np.where(joined, np.maximum(off_mm, 0.0) / cell_mm, 0.0))
+        if (before := clock_s < joined_s).any():  # along centres, where no recording has been outside of its cell
+            cells = np.abs(places[before][:, None] - self.request.policy.path.grid.centres_mm(states)) / cell_mm - 0.5
+            self.put("path off the policy's cells", a1[before], np.linalg.norm(cells.clip(0.0), axis=2).min(axis=1))
         joining = hand.between(joined_s, firm_s)
         if self.request.turning:
             self._turning(hand, at, firm, joining)
@@ -173,6 +181,19 @@ class PassComparison:
         slow_s = np.where(clock_s >= joined_s, (hand.calm_s if self.request.turning else hand.slow_s)[at], 0.0)
         rests_s = np.where(np.minimum(passed_s, passed_s[-1] - passed_s) < REST_S / self.tempo, 2 * REST_S, 0.0)
         self._stands(STAND_S + (slow_s + rests_s) / self.tempo)
+
+    def _moved_mm(self, hand: RecordedHand, at: Ints) -> Floats:
+        """Return how far a path may be from the recording because hysteresis left an end of that outside of its cell.
+
+        The path ends in the cell, and joins the recording over the length of one cell.
+        """
+        request, way = self.request, lengths_along(hand.tip_mm)
+        assert request.demo is not None
+        moved_mm, over_mm = np.zeros(len(at)), request.policy.path.grid.cell_mm
+        for end, place_mm in ((0, request.first_mm), (-1, request.goal_mm)):
+            near = 1.0 - (np.abs(way[at] - way[end]) / over_mm - 1.0).clip(0.0, 1.0)
+            moved_mm += near * _far_mm(request.demo.tip_mm[end], place_mm)
+        return moved_mm
 
     def _clock(self, states: Ints, passed_s: Floats) -> tuple[Floats, float, float]:
         """Return the demonstration's time at each sample of A1, and from when on it is followed, and has to be.
@@ -434,7 +455,7 @@ def _off_cells(places: Floats, cells: Ints, reach: float) -> Floats:
         cells: Shape (V, 3).
         reach: How far from its centre a cell reaches: half of it, and as far as hysteresis lets a recording leave it.
     """
-    limit, number = LIMITS["path off the policy's cells"][1], np.arange(len(cells))
+    number = np.arange(len(cells))
     moved = lengths_along(places)
     _, looked = np.unique((moved / CELL_STEP).astype(np.int64), return_index=True)
     looked = np.union1d(looked, [len(places) - 1])
@@ -442,7 +463,7 @@ def _off_cells(places: Floats, cells: Ints, reach: float) -> Floats:
     within = number == 0
     for sample in looked.tolist():
         away = np.linalg.norm(np.maximum(np.abs(places[sample] - cells) - reach, 0.0), axis=1)
-        near = away <= limit
+        near = away <= NEAR_CELL
         seed = near & (within | np.append(False, within[:-1]))
         reached = near & (
             np.maximum.accumulate(np.where(seed, number, -1)) > np.maximum.accumulate(np.where(near, -1, number))

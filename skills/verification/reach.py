@@ -37,7 +37,7 @@ from skills.planning.trajectory import PSM_A, PSM_M, PassPoses, Trajectory, pose
 from skills.verification import clearance
 from skills.verification.bodies import distances_at, moved_mm
 from skills.verification.gates import Limits
-from skills.verification.scene_clearance import LOOK_MM, TISSUE, from_parts, groups_of, limit_of, needle_from_tissue
+from skills.verification.scene_clearance import LOOK_MM, TISSUE, from_parts, groups_of, limit_of, needle_from_parts
 
 MAX_PLACES = 1000
 STEP_MM = 1.0  # ours: of both tips together, or two degrees of a jaw
@@ -256,7 +256,13 @@ class _Moved:
             yield looks.check("tools", apart, looks.of_both(ways), self.limits.clearance_psm_m_mm)
         if scene is None:
             return
-        found: list[_Check] = []
+        needle = needle_from_parts(motion, scene, looks.rows)
+        needle_way = looks.split(_with_last(clearance.needle_travel_mm(motion)[:, None]))
+        found = [
+            looks.check("scene", apart, needle_way, limit_of(scene), LOOK_MM / 2)
+            for part, apart in needle.items()
+            if part != TISSUE
+        ]
         for arm, group in groups_of(motion):
             way = looks.split(_with_last(np.diff(group.way_mm, axis=0)))
             found += [
@@ -272,9 +278,8 @@ class _Moved:
                 np.min([one.least for one in found], axis=0),
             )
         if scene.tissue is not None:
-            apart = needle_from_tissue(motion, scene.tissue, looks.rows)[TISSUE]
-            way = looks.split(_with_last(clearance.needle_travel_mm(motion)[:, None]))
-            check = looks.check("needle", apart, way, 0.0, LOOK_MM / 2)
+            apart = needle[TISSUE]
+            check = looks.check("needle", apart, needle_way, 0.0, LOOK_MM / 2)
             # One that begins in the tissue comes out first, by hand; until when, a few poses do not tell.
             begins = looks.per_place(apart)[:, 0, 0]
             yield replace(check, no=check.no & (begins >= 0))

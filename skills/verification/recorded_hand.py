@@ -1,10 +1,11 @@
-"""The recorded hand, moment by moment: its mean over a short time, and its samples' spread about that.
+"""The recorded hand, moment by moment: its mean over a short time, and its samples' spread about a steady motion.
 
     Demo --RecordedHand.of--> RecordedHand
 
 A motion that repeats a hand may average it over a quarter of a second, to leave out its tremor. So it is compared not
-with a sample but with those of `HALF_S` before and after: they lie within some distance, the spread, of their mean. All
-of this is ours, and nothing of it is used in planning.
+with a sample but with those of half of that before and after. An even average of a steady motion is its middle; so what
+an average can be off their mean is how far they lie from a straight and steady motion through it. That is the spread,
+and the way of one step: the nearest moment is up to half a step away. All of this is ours; planning uses none of it.
 """
 
 from dataclasses import dataclass
@@ -19,20 +20,21 @@ from skills.kinematics import angle_between, instrument_of, matrix_of
 
 # Ours: planning averages a hand over a quarter of a second, and its tip twice.
 HALF_S = 0.25
+AVERAGED_S = 0.125  # to either side
 REST_S = 0.125  # a hand rests for so long before its first sample and after its last
 SLOW = 0.1  # of the hand's greatest speed: where it was slower, an arm may stand
-MOMENTS = 60  # at most so many of an interval are compared
+MOMENTS = 240  # at most so many of an interval are compared
 _STEP_S = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedHand:
-    """A recorded hand at even times, N of them: means over `HALF_S` to either side, and the samples' spread about them.
+    """A recorded hand at even times, N of them: means over `AVERAGED_S` to either side, and their spread.
 
     Attributes:
         seconds: The times, from before its first sample to after its last.
         tip_mm: Mean of the tip, shape (N, 3).
-        tip_spread_mm: Greatest distance from it, shape (N,).
+        tip_spread_mm: Greatest distance from a steady motion, shape (N,).
         turned: Mean rotation, shape (N, 3, 3), and `turned_spread_deg`; None if not recorded.
         opened: Mean angle of the jaw, shape (N,), and `opened_spread`; None if it was not recorded or has another zero.
         slow_s: Seconds for which the tip was slow, without a break, around each time, shape (N,).
@@ -52,7 +54,7 @@ class RecordedHand:
     @classmethod
     def of(cls, demo: Demo) -> "RecordedHand":
         """Return the moments of a demonstration."""
-        half, before = round(HALF_S / _STEP_S), np.ceil((HALF_S + 2 * REST_S) / _STEP_S)
+        half, before = round(AVERAGED_S / _STEP_S), np.ceil((HALF_S + 2 * REST_S) / _STEP_S)
         count = int(np.ceil(demo.stamps_s[-1] / _STEP_S) + 2 * before + 1)
         fine_s = (np.arange(count) - before) * _STEP_S
         seconds = fine_s[half:-half]
@@ -83,6 +85,13 @@ class RecordedHand:
         steps = (seconds - self.seconds[0]) / _STEP_S
         return np.asarray(np.nan_to_num(np.rint(steps)).clip(0, len(self.seconds) - 1), np.int64)
 
+    def off_mm(self, tip_mm: Floats, at: Ints) -> Floats:
+        """Return how far places, (T, 3), are beyond the spread of the nearest of the moments around some, (T,)."""
+        half = round(AVERAGED_S / _STEP_S)
+        near = (at[:, None] + np.arange(-half, half + 1)).clip(0, len(self.seconds) - 1)
+        apart = np.linalg.norm(tip_mm[:, None] - self.tip_mm[near], axis=2) - self.tip_spread_mm[near]
+        return np.asarray(apart.min(axis=1))
+
     def between(self, begin_s: float, end_s: float) -> Ints:
         """Return moments from one time to another and `HALF_S` around them, 1 to `MOMENTS`."""
         edges = np.array([begin_s - HALF_S, end_s + HALF_S]).clip(self.seconds[0], self.seconds[-1])
@@ -91,10 +100,11 @@ class RecordedHand:
 
 
 def _spread(values: Floats, half: int) -> tuple[Floats, Floats]:
-    """Return the mean of rows, (N, D), over a window, and the greatest distance from it within the window."""
-    windows = sliding_window_view(values, 2 * half + 1, axis=0)
-    mean = windows.mean(axis=2)
-    return mean, np.linalg.norm(windows - mean[:, :, None], axis=1).max(axis=1)
+    """Return the mean of rows, (N, D), over a window, and their spread within the window; see the module."""
+    windows, steps = sliding_window_view(values, 2 * half + 1, axis=0), np.arange(-half, half + 1)
+    mean, rate = windows.mean(axis=2), windows @ steps / (steps @ steps)
+    off = windows - mean[:, :, None] - rate[:, :, None] * steps
+    return mean, np.linalg.norm(off, axis=1).max(axis=1) + np.linalg.norm(rate, axis=1)
 
 
 def _unbroken_s(slow: Flags) -> Floats:

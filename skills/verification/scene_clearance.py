@@ -14,9 +14,11 @@ must be kept, if it is larger than `SceneReport.limit_mm` would be without it. A
 they are not compared with PSM_M. Tissue has no edge, so it is compared with the parts that are above it alone: tools,
 cannula and its mount, insertion axis and carriage.
 
-**Needle.** While PSM_A holds the needle, in A1 and A2, no part of it may be inside the tissue. It enters and leaves by
-the surgeon's hand, before A1 and after A2 (M1, M2): so at the beginning of A1 it may be inside, until it is out for the
-first time. In a transfer to a further pass it is the surgeon's, and not judged.
+**Needle.** From boxes, and from the arm that does not hold it, the needle keeps the distances of a tool, wherever it is
+held; fingers that come to take it do not count. While PSM_A holds it, in A1 and A2, no part of it may be inside the
+tissue. It enters and leaves by the surgeon's hand, before A1 and after A2 (M1, M2): so at the beginning of A1 it may be
+inside, until it is out for the first time. In a transfer to a further pass it is the surgeon's as far as tissue goes,
+and altogether if PSM_M's place is not known.
 """
 
 from collections.abc import Callable
@@ -31,8 +33,8 @@ from skills.arrays import Flags, Floats, Ints, xyz
 from skills.fields import Count, Figure, Point, schema
 from skills.gridworld.scene import Scene, Tissue
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
-from skills.planning.motion_laws import A2, TRANSFER
-from skills.planning.trajectory import PSM_A, PSM_M, PlannedArm, SampleMoment, Trajectory
+from skills.planning.motion_laws import A1, A2
+from skills.planning.trajectory import PSM_A, PSM_M, STANDS, PlannedArm, SampleMoment, Trajectory
 from skills.verification import clearance
 from skills.verification.bodies import ABOVE_TISSUE, TOOL, moved_mm, names_of, placed, radii_of
 from skills.verification.clearance import way_mm
@@ -134,16 +136,19 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
         at_least[looks] = np.min([at_least[looks], *bounds], axis=0)
         looked[looks] = True
         nearest += [_nearest(trajectory, arm.name, group.names, part, looks, apart) for part, apart in of_parts.items()]
-    needle = np.full(len(trajectory), np.inf)
-    if scene.tissue is not None:
-        way = way_mm(clearance.needle_travel_mm(trajectory)[:, None])
-        begins = np.flatnonzero(np.diff(trajectory.phase) | np.diff(trajectory.pass_index)) + 1
-        ends = np.concatenate([begins - 1, begins])
-        looks, seen = _looked_at(partial(needle_from_tissue, trajectory, scene.tissue), way, LOOK_MM, 0.0, ends)
-        apart = seen[TISSUE]
-        needle[looks] = _until_next(apart, way[looks])
-        needle[_by_hand(trajectory, needle)] = np.inf
-        nearest.append(_nearest(trajectory, NEEDLE, (ARC,), TISSUE, looks, apart))
+    needle, (way, ends) = np.full(len(trajectory), np.inf), _needle_way(trajectory)
+    judged = ~clearance.by_psm_m(trajectory) if trajectory.psm_m is None else np.ones(len(trajectory), bool)
+    distances = partial(needle_from_parts, trajectory, scene)
+    looks, seen = _looked_at(distances, way, LOOK_MM, limit_mm, ends)
+    for part, apart in seen.items():
+        bound = _until_next(apart, way[looks])
+        if part == TISSUE:
+            needle[looks] = bound
+        else:
+            at_least[looks] = np.minimum(at_least[looks], np.where(judged[looks], bound, np.inf))
+            apart = np.where(judged[looks, None], apart, np.inf)
+        nearest.append(_nearest(trajectory, NEEDLE, (ARC,), part, looks, apart))
+    needle[_by_hand(trajectory, needle)] = np.inf
     nearest.sort(key=lambda pair: float(np.nan_to_num(pair[0], nan=-np.inf)))
     least, least_needle = float(at_least.min()), float(needle.min())
     return SceneClearance(
@@ -331,26 +336,72 @@ def from_parts(group: Group, scene: Scene, body: str, at: Ints) -> dict[str, Flo
     return found
 
 
-def needle_from_tissue(trajectory: Trajectory, tissue: Tissue, at: Ints) -> dict[str, Floats]:
-    """Return lower bounds on the distances of the needle in PSM_A's jaws from tissue.
+def _needle_way(trajectory: Trajectory) -> tuple[Floats, Ints]:
+    """Return how far the needle can have moved since the first sample, (T, 1), and both sides of changes of phase."""
+    begins = np.flatnonzero(np.diff(trajectory.phase) | np.diff(trajectory.pass_index)) + 1
+    return way_mm(clearance.needle_travel_mm(trajectory)[:, None]), np.concatenate([begins - 1, begins])
+
+
+def needle_from_parts(trajectory: Trajectory, scene: Scene, at: Ints) -> dict[str, Floats]:
+    """Return lower bounds on the distances of the needle from each part of a scene, by its name, at some samples.
 
     Args:
         trajectory: The motion.
-        tissue: The tissue, in the frame of PSM_A's base.
+        scene: The scene, in the frame of PSM_A's base; its margin is not taken off.
         at: The samples, shape (C,).
 
     Returns:
-        Bounds in mm, negative inside, shape (C, 1), by the name `TISSUE`.
+        Bounds in mm, negative inside, shape (C, 1); infinite from the scene's other arm while that holds the needle.
     """
-    arc_mm, thick_mm = clearance.needle_arc_mm(trajectory, at), clearance.NEEDLE_THICK_MM / 2 + clearance.ARC_BULGE_MM
-    # The chords from point to point, because a ridge may be between two of them.
-    apart = tissue.from_lines_mm(arc_mm[:, :-1], arc_mm[:, 1:], within_mm=CLEARANCE_SEEN_MM + thick_mm)
-    return {TISSUE: apart.min(axis=1)[:, None] - thick_mm}
+    arc = clearance.needle_arc_mm(trajectory, at)
+    begin, end = arc[:, :-1], arc[:, 1:]
+    found, by_psm_m = {}, clearance.by_psm_m(trajectory)[at]
+    if scene.tissue is not None:
+        within_mm = CLEARANCE_SEEN_MM + clearance.NEEDLE_REACH_MM
+        found[TISSUE] = scene.tissue.from_lines_mm(begin, end, within_mm=within_mm)
+    found |= {f"box {k}": box.from_lines_mm(begin, end) for k, box in enumerate(scene.boxes)}
+    for k, capsule in enumerate(scene.capsules):
+        found[f"capsule {k}"] = np.where(by_psm_m[:, None], np.inf, capsule.from_lines_mm(begin, end))
+    return {part: apart.min(axis=1)[:, None] - clearance.NEEDLE_REACH_MM for part, apart in found.items()}
+
+
+def needle_from_arm(trajectory: Trajectory, limit_mm: float) -> Floats:
+    """Return lower bounds on the needle's distance from the arm that does not hold it, until the next look, (T,).
+
+    That arm's fingers do not count from A2 on, and where PSM_M waits with its jaws around the needle: they come to take
+    it. Without PSM_M, and between two looks, the bound is infinite.
+
+    Args:
+        trajectory: The motion of PSM_A, and of PSM_M if it moves.
+        limit_mm: The distance that must be kept.
+    """
+    apart, m = np.full(len(trajectory), np.inf), trajectory.psm_m
+    if m is None:
+        return apart
+    taking = trajectory.last_samples[trajectory.pass_index]
+    comes = (trajectory.phase != A1) | (np.abs(m.joints - m.joints[taking]) <= STANDS).all(axis=1)
+
+    def distances(at: Ints) -> dict[str, Floats]:
+        """Return the least distances at some samples, (C, 1)."""
+        arc, by_psm_m = clearance.needle_arc_mm(trajectory, at), clearance.by_psm_m(trajectory)[at]
+        found = np.full((len(at), 1), np.inf)
+        for arm, other in zip(trajectory.arms, (by_psm_m, ~by_psm_m), strict=True):
+            near = np.min([clearance.lines_apart(arc[other], one) for one in links_at(arm, at[other])], 0)
+            near[comes[at[other]], clearance.FINGERS] = np.inf
+            found[other, 0] = near.min(axis=1) - clearance.NEEDLE_REACH_MM
+        return {NEEDLE: found}
+
+    way, ends = _needle_way(trajectory)
+    for arm in trajectory.arms:
+        way = way + way_mm(clearance.travel_mm(arm.joints, arm.instrument).max(axis=1)[:, None])
+    looks, seen = _looked_at(distances, way, LOOK_MM, limit_mm, ends)
+    apart[looks] = _until_next(seen[NEEDLE], way[looks])
+    return apart
 
 
 def _by_hand(trajectory: Trajectory, needle_mm: Floats) -> Flags:
     """Mark the samples, (T,), at which the needle may be in tissue: see the head of this file."""
-    may = (trajectory.phase == TRANSFER) & (trajectory.pass_index > 0)
+    may = clearance.by_psm_m(trajectory)
     for number in range(trajectory.passes):
         coming = np.flatnonzero((trajectory.pass_index == number) & (trajectory.phase != A2) & ~may)
         looked = needle_mm[coming]

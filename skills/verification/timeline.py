@@ -33,8 +33,8 @@ from skills.fields import Column, Count, schema
 from skills.kinematics import INSTRUMENTS, matrix_of, quaternion_of
 from skills.planning.motion_laws import PHASES
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
-from skills.verification.bodies import between, names_of, parts_of, radii_of
-from skills.verification.clearance import FINGER_MM, Links
+from skills.verification.bodies import Parts, between, names_of, parts_of, radii_of
+from skills.verification.clearance import FINGER_MM
 from skills.verification.gates import Limits
 from skills.verification.playback import Playback
 
@@ -203,7 +203,7 @@ class _Clock:
         joints: _Samples | None = None,
         instrument: str | None = None,
         base: _Base | None = None,
-    ) -> tuple[ArmTrack, Links | None]:
+    ) -> tuple[ArmTrack, Parts | None]:
         """Return an arm's columns, and its parts at the rows of bodies.
 
         Args:
@@ -242,15 +242,15 @@ class _Clock:
         )
         return track, parts
 
-    def timeline(self, kind: Kind, arms: Sequence[tuple[ArmTrack, Links | None]], **more: Any) -> Timeline:
+    def timeline(self, kind: Kind, arms: Sequence[tuple[ArmTrack, Parts | None]], **more: Any) -> Timeline:
         """Return a timeline of arms, with the distance between the bodies of the first two if both are known."""
         steps = [np.linalg.norm(np.diff(one.tip_mm, axis=0), axis=1) for one, _ in arms]
         way = np.append(0.0, np.cumsum(np.nan_to_num(np.sum(steps, axis=0))))
         traces = list(more.pop("traces", ()))
         posed = [(track, parts) for track, parts in arms[:2] if parts is not None and more["in_one_frame"]]
         if len(posed) == 2:
-            (a, parts), (b, others) = posed
-            apart = between(parts, radii_of(str(a.instrument)), others, radii_of(str(b.instrument))).min(axis=(1, 2))
+            (_, parts), (_, others) = posed
+            apart = between(parts, others).min(axis=(1, 2))
             values = np.interp(self.at_s, self.at_s[:: self.every], apart)
             traces.insert(0, Trace("Outer bodies apart", "mm", Limits().clearance_bodies_mm, _column(values)))
         return Timeline(

@@ -39,7 +39,15 @@ from skills.verification.monte_carlo import estimate_success
 from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, Playback
 from skills.verification.probabilities import UPWARDS, SuccessEstimate
 from skills.verification.requested import requested_motion
-from skills.verification.scene_clearance import NEEDLE, SceneClearance, SceneReport, clearance_of, flat_tissue
+from skills.verification.scene_clearance import (
+    NEEDLE,
+    TISSUE,
+    SceneClearance,
+    SceneReport,
+    clearance_of,
+    flat_tissue,
+    needle_from_arm,
+)
 
 
 @schema
@@ -234,7 +242,16 @@ def judge(
     figures = figures_of(playback, trajectory)
     outer = bodies_clearance(trajectory, limits.clearance_bodies_mm)
     gated = limits if pad_is_tissue else replace(limits, clearance_pad_mm=-inf)
-    failure = first_failure(figures, playback, trajectory, gated, beside, outer, intent)
+    failure = first_failure(
+        figures,
+        playback,
+        trajectory,
+        gated,
+        beside,
+        outer,
+        intent,
+        needle_from_arm(trajectory, limits.clearance_psm_m_mm),
+    )
     psm_a = figures.arms[0]
     with_m = trajectory.psm_m is not None
     touching = figures.effort[~(playback.contact_n <= 0)]  # negated, so that NaN counts as contact
@@ -301,7 +318,11 @@ class PlanVerdict:
     def failure_sentence(self) -> str | None:
         """The reason why it is not feasible; one beside a scene also names the nearest parts."""
         failure = self.report.failure
-        near = [] if self.scene is None else [one for one in self.scene.nearest if one.body != NEEDLE]
+        near = (
+            []
+            if self.scene is None
+            else [one for one in self.scene.nearest if (one.body, one.part) != (NEEDLE, TISSUE)]
+        )
         if failure is None or failure.quantity != SCENE or not near:
             return None if failure is None else str(failure)
         return f"{failure} Nearest: {near[0]}."

@@ -191,6 +191,34 @@ def test_other_names_of_joints_or_frames_are_found(names, frame):
         checked(rewritten(change))
 
 
+def test_a_jaw_in_a_frame_is_found():
+    """It has none, as those of the dVRK."""
+
+    def change(one: bag_writer.Message) -> bag_writer.Message:
+        if one.topic != PSM2[2]:
+            return one
+        return bag_writer.joint_state(one.topic, one.log_ns, [0.1], ["jaw"], velocities=[0.0], frame="PSM2_base")
+
+    with pytest.raises(BadBag, match="other names of joints or frames"):
+        checked(rewritten(change))
+
+
+@pytest.mark.parametrize("topic", PSM2)
+@pytest.mark.parametrize("about", [{"offered_qos_profiles": "- durability: 1"}, {"callerid": "/other"}, {}])
+def test_another_quality_of_service_of_a_topic_is_found(monkeypatch, topic, about):
+    """Such as a latched one, which a controller that comes late would still obey."""
+    real = McapWriter.register_channel
+
+    def register(self, name, encoding, schema, metadata):
+        return real(self, name, encoding, schema, about if name == topic else metadata)
+
+    monkeypatch.setattr(McapWriter, "register_channel", register)
+    changed = rewritten(lambda one: one)
+    monkeypatch.undo()
+    with pytest.raises(BadBag, match=f"{topic} offers another quality of service"):
+        checked(changed)
+
+
 def test_a_pose_in_another_frame_is_found():
     with pytest.raises(BadBag, match="other names of joints or frames"):
         checked(remade(replace(arm(), frame="ECM")))

@@ -251,6 +251,18 @@ def test_an_unsigned_bag_is_readable_and_called_so():
         checked(members())
 
 
+def test_a_bag_that_says_it_was_signed_is_refused_without_its_signature():
+    """Also without a key: the README names the signature that is no longer there, and all checksums are right."""
+    said = {
+        "README.txt": b"1. `skills verify FILE.zip --key KEY`, with the key of the service that wrote signature.dsse.\n"
+    }
+    whole = signed(bag_of(moved(JOINTS)) | said)
+    assert checked(whole) and checked(whole, None)
+    removed = {name: data for name, data in whole.items() if name != SIGNATURE}
+    with pytest.raises(BadBag, match=r"no signature\.dsse, which README\.txt or the key demands: it was removed"):
+        checked(removed, None)
+
+
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_consistent_change_with_right_checksums_is_refused(name: str):
     assert len(CHANGES) >= 20

@@ -22,7 +22,7 @@ from skills.verification.clearance import (
 )
 from skills.verification.gates import SCENE
 from skills.verification.playback import CLEARANCE_SEEN_MM
-from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of, flat_tissue, needle_from_tissue
+from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of, flat_tissue, needle_from_parts
 from skills.verification.verdict import judge
 from tests.planning.motions import ideal_playback
 from tests.verification.test_verdict import TRAJECTORY, beside, with_psm_m
@@ -69,6 +69,8 @@ def test_no_sample_is_nearer_than_the_bound_says(part):
             a, b = ARM.begin_mm[sample, link], ARM.end_mm[sample, link]
             along = a + np.linspace(0, 1, 417 if link == 0 else 101)[:, None] * (b - a)
             nearest.append(scene.clearance_mm(along).min() - RADII_MM[link])
+        if scene.tissue is None:
+            nearest.append(scene.clearance_mm(needle_arc_mm(TRAJECTORY, np.array([sample]))).min() - RADIUS_MM)
     least = min(nearest)
     steep = 1.0 if scene.tissue is None else 1.05  # of slopes of 0.2, and a plane that leans by 6 degrees
     assert report.at_least_mm <= least + 1e-9
@@ -101,7 +103,7 @@ def test_joints_that_are_not_numbers_are_not_free():
     joints = np.array(TRAJECTORY.joints)
     joints[7] = np.nan
     lost = object.__new__(type(TRAJECTORY))
-    lost.__dict__.update(vars(TRAJECTORY) | {"joints": joints})
+    lost.__dict__.update({name: one for name, one in vars(TRAJECTORY).items() if name != "arms"} | {"joints": joints})
     near = clearance_of(lost, below(30.0))
     assert not judge(ideal_playback(TRAJECTORY), TRAJECTORY, beside=near).feasible
 
@@ -138,17 +140,18 @@ def test_an_empty_scene_and_a_far_one_are_free():
 
 
 def test_a_box_beside_the_arm_outside_of_the_patient_is_found_and_named():
-    """A stand next to the insertion axis, whose radius is 60 mm, 40 mm behind the tool; the tool is far from it."""
+    """A stand next to the insertion axis, whose radius is 50 mm, 40 mm behind the tool; the tool is far from it."""
     stand = Scene("PSM2_base", boxes=(Box((62.0, -60.0, 200.0), (100.0, -20.0, 400.0)),))
     found = clearance_of(TRAJECTORY, stand)
     assert found.report.bodies
     nearest = found.report.nearest[0]
     assert (nearest.body, nearest.part) == (PSM_A, "box 0")
-    assert nearest.link in ("insertion axis", "carriage", "bars")
+    assert nearest.link in ("insertion axis", "carriage", "lower bar", "upper bar", "cannula mount")
     every = parts_of(TRAJECTORY.joints, TRAJECTORY.instrument)
     radii = radii_of(TRAJECTORY.instrument)
     least = min(
-        (stand.boxes[0].from_lines_mm(every.begin_mm[:, k], every.end_mm[:, k]) - radii[k]).min() for k in range(10)
+        (stand.boxes[0].from_lines_mm(every.begin_mm[:, k], every.end_mm[:, k]) - radii[k]).min()
+        for k in range(len(radii) - 2)
     )
     assert least - LOOK_BODIES_MM <= found.at_least_mm.min() <= least + 1e-9
 
@@ -193,13 +196,13 @@ def test_between_two_points_of_the_arc_nothing_is_nearer_than_the_bound():
             nearest = tissue.above_mm(wire).min(axis=1)
             assert (nearest > 0).any()
             exact = np.where(nearest > 0, nearest / tissue.steep, nearest) - RADIUS_MM
-            bound = needle_from_tissue(TRAJECTORY, tissue, at)["tissue"][:, 0]
+            bound = needle_from_parts(TRAJECTORY, Scene("PSM2_base", tissue=tissue), at)["tissue"][:, 0]
             seen = bound < CLEARANCE_SEEN_MM
             assert (bound[seen] <= exact[seen]).all()
             assert (bound[seen] >= exact[seen] - 0.7).all()
     level = Tissue.plane((0.0, 0.0, -170.0), (0.1, 0.0, 1.0))
     apart = level.above_mm(wire).min(axis=1) - RADIUS_MM
-    bound = needle_from_tissue(TRAJECTORY, level, at)["tissue"][:, 0]
+    bound = needle_from_parts(TRAJECTORY, Scene("PSM2_base", tissue=level), at)["tissue"][:, 0]
     assert (bound <= apart).all() and (bound >= apart - 0.01).all()
 
 

@@ -74,7 +74,8 @@ class MessageSchema:
 class Channel:
     """A topic of one publisher; `schema` is 0 if its messages have no type.
 
-    `publisher` is the name of its node, which only bags of ROS 1 have, and otherwise "".
+    `publisher` is the name of its node, which only bags of ROS 1 have, and otherwise ""; `qos` the text of the profiles
+    that were offered.
     """
 
     number: int
@@ -82,6 +83,7 @@ class Channel:
     topic: str
     encoding: str
     publisher: str = ""
+    qos: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,7 +385,9 @@ class Walker:
             same = number != 0 and self.schemas.setdefault(number, schema) == schema
         else:
             channel = Channel(number, fields.number(2), fields.text(), fields.text())
-            channel = replace(channel, publisher=fields.texts().get("callerid", "")[:80])
+            about = fields.texts()
+            qos = about.get("offered_qos_profiles", "")
+            channel = replace(channel, publisher=about.get("callerid", "")[:80], qos=qos)
             same = self.channels.setdefault(number, channel) == channel
             if channel.schema and channel.schema not in self.schemas:
                 raise UnreadableRecording(f"{channel.topic!r} has a type that is not defined before it. {RECOVER}")
