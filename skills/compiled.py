@@ -54,9 +54,9 @@ class Loop:
             while _INNER:
                 register_jitable(_INNER.pop())
         try:
-            return njit(nogil=True, cache=True)(self.plain)
+            return njit(nogil=True, cache=True, error_model="numpy")(self.plain)
         except RuntimeError:  # raised by numba if no cache folder is writable
-            return njit(nogil=True)(self.plain)
+            return njit(nogil=True, error_model="numpy")(self.plain)
 
     @property
     def cache_folder(self) -> Path | None:
