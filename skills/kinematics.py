@@ -450,9 +450,9 @@ def _wave(angle: float, ahead: int) -> float:
     """Return `sin`, or a quarter turn ahead `cos`, of `skills.arithmetic`, with the same bits."""
     turns = float(np.rint(angle * (2 / pi)))
     rest = angle - turns * QUARTER[0] - turns * QUARTER[1] - turns * QUARTER[2]
-    quarter = (turns + ahead) - 4 * np.floor((turns + ahead) / 4)
+    quarter = (turns + ahead) - 4 * float(np.floor((turns + ahead) / 4))
     upright = quarter == 1 or quarter == 3
-    value = _series(COSINE, rest * rest) if upright else rest * _series(SINE, rest * rest)
+    value: float = _series(COSINE, rest * rest) if upright else rest * _series(SINE, rest * rest)
     return -value if quarter >= 2 else value
 
 
