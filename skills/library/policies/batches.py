@@ -45,7 +45,7 @@ from skills.schemas.policies import PolicyManifest
 from skills.schemas.training import FitOnTheSame, PolicyFigures, StoredComparison
 from skills.settings import Settings
 
-TOGETHER = 50  # styles
+TOGETHER = 25  # styles
 TOGETHER_S = 1.0  # the longest time that a result waits for the next one, and that a cancelled batch continues
 NEARLY_ONE = 1 - 1e-9  # the sum of all progress steps, below 1 so that rounding cannot exceed 1
 

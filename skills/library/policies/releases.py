@@ -256,6 +256,8 @@ def _held(policy: PolicyVersion, constant_turn_deg: float) -> list[GateRefusal]:
     driven = policy.manifest.grid_certificate.driven
     if driven is None or driven.orientation == "recorded":
         return []
+    if driven.orientation == "assumed tool-down" and policy.manifest.combined is None:
+        return []  # its demonstration has no orientation, so it does not have to be read
     turns_deg = [turn.deg for one in policy.demonstrations if (turn := departure_of(one.demo)) is not None]
     if all(deg <= constant_turn_deg for deg in turns_deg):  # each, because `max` passes over a NaN
         return []
