@@ -14,7 +14,7 @@ from datetime import date
 from functools import cache
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Row, Text, and_, bindparam, cast, or_
+from sqlalchemy import BindParameter, ColumnElement, Row, Text, and_, bindparam, cast, or_
 
 from skills.db import now
 from skills.db.models import Surgeon
@@ -75,7 +75,5 @@ def covered(use: Use) -> ColumnElement[bool]:
     until = Surgeon.consent["until"].as_string()
     # A substring search is exact: besides `uses`, the only text in a consent is a date.
     named = AS_TEXT.contains(json.dumps(use))
-    return or_(
-        AS_TEXT.is_(None),
-        and_(named, or_(until.is_(None), until >= bindparam(None, callable_=lambda: today().isoformat()))),
-    )
+    day: BindParameter[str] = bindparam(None, callable_=lambda: today().isoformat())
+    return or_(AS_TEXT.is_(None), and_(named, or_(until.is_(None), until >= day)))

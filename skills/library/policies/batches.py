@@ -36,7 +36,6 @@ from skills.library.policies import learning, releases
 from skills.library.policies.combined import refuse_unlike
 from skills.library.policies.fit import compare_paths, format_mm, not_worse, policy_path, reference_paths
 from skills.library.policies.learning import Learnt, Lesson, Stored, combined_lesson, learn_style, lessons
-from skills.library.policies.releases import Released
 from skills.library.policies.requests import RetrainingRequest, TrainingRequest, requests_of_served
 from skills.library.recordings.demos import newest_demos
 from skills.library.recordings.recordings import Parser, confined_reader
@@ -233,7 +232,7 @@ def _outcomes(
     stored = {one: at for one, at in of_learnt.items() if isinstance(at, Stored)}
     compared = {one: _compared(one, at, measured.get(one.sha256)) for one, at in stored.items()}
     if batch.request.release:
-        compared = _release(session, batch, stored, compared, measured)
+        compared = dict(_release(session, batch, stored, compared, measured))
     for style, one in ended:
         ending = {"row": style.row, "ended_at": now(), "policy_row": None, "comparison": None, "reason": None}
         if isinstance(one, Learnt) and one in stored:
@@ -346,27 +345,20 @@ def _release(
     stored: Mapping[Learnt, Stored],
     compared: Mapping[Learnt, StoredComparison],
     measured: Mapping[str, _Measured],
-) -> dict[Learnt, StoredComparison]:
-    """Release the versions that are not worse than the released ones; return the comparisons with the outcome."""
+) -> Iterator[tuple[Learnt, StoredComparison]]:
+    """Release the versions that are not worse than the released ones; yield the comparisons with the outcome."""
     by, turn_deg = batch.requested_by, batch.settings.constant_turn_deg
-    served = {one: None if (m := measured.get(one.sha256)) is None else m.served for one in stored}
-    new = {at.row: served[one] for one, at in stored.items() if at.new and not compared[one].worse_because}
-    made = releases.release_new(session, new, by, turn_deg)
+    better = {one: at for one, at in stored.items() if at.new and not compared[one].worse_because}
+    served = {at.row: m.served if (m := measured.get(one.sha256)) else None for one, at in better.items()}
+    made = releases.release_new(session, served, by, turn_deg)
     for one, comparison in compared.items():
         row = stored[one].row
         if comparison.worse_because:
             because = f"It is worse than the released version: {'; '.join(comparison.worse_because)}."
-            made[row] = Released(
-                False, because, "Release it by its number if it is to replace the released version anyway."
-            )
-        elif row not in made:
-            made[row] = releases.try_release(session, session.get_one(PolicyVersion, row), by, turn_deg)
-    return {
-        one: replace(
-            comparison,
-            now_released=(outcome := made[stored[one].row]).released,
-            not_released_because=outcome.not_released_because,
-            remedy=outcome.remedy,
-        )
-        for one, comparison in compared.items()
-    }
+            advice = "Release it by its number if it is to replace the released version anyway."
+            yield one, replace(comparison, not_released_because=because, remedy=advice)
+            continue
+        # a version that was stored before is verified
+        at = made.get(row) or releases.try_release(session, session.get_one(PolicyVersion, row), by, turn_deg)
+        why, remedy = at.not_released_because, at.remedy
+        yield one, replace(comparison, now_released=at.released, not_released_because=why, remedy=remedy)

@@ -27,7 +27,7 @@ from sqlalchemy import (
     select,
     type_coerce,
 )
-from sqlalchemy.orm import Session, aliased, joinedload, selectinload
+from sqlalchemy.orm import Session, aliased, selectinload
 
 from skills.db import now
 from skills.db.changes import announce
@@ -235,7 +235,7 @@ def release_new(
     found, passed = dict.fromkeys(policies, Released(True, None, None)), []
     query = select(PolicyVersion).where(PolicyVersion.row.in_(policies))
     for one in session.scalars(
-        query.options(joinedload(PolicyVersion.demonstration), selectinload(PolicyVersion.others))
+        query.options(selectinload(PolicyVersion.demonstration), selectinload(PolicyVersion.others))
     ):
         try:
             _refuse(session, one, policies[one.row], constant_turn_deg)
