@@ -4,9 +4,9 @@ A style that cannot be learnt fails with its reason, and the others continue. If
 continues its part at the first style without a result; styles that were already started are then trained last, one by
 one, because one of them may have killed the worker.
 
-Slow styles are committed alone. Quick styles are committed a few together, and stored with common statements: a commit
-waits for the disk while it holds its locks (on SQLite the only one of all writers), so with a commit for each style
-several workers would leave no room for others.
+Slow styles are committed alone. Quick styles are committed some together, stored and released with common statements: a
+commit waits for the disk while it holds its locks (on SQLite the only one of all writers), so with a commit for each
+style several workers would leave no room for others.
 """
 
 import logging
