@@ -6,6 +6,7 @@ uv python install 3.11), or say where yours is: make PYTHON=/path/to/python3.11'
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+SERVES := $(VENV)/.serves
 export SKILLS_SAMPLE_RECORDINGS ?= $(abspath $(wildcard ../shared/recordings))
 # Compiled once: a process that compiles all of ours for itself takes three times as long to start.
 export PYTHONDONTWRITEBYTECODE :=
@@ -29,19 +30,32 @@ export PIP_FIND_LINKS := $(abspath $(WHEELHOUSE))
 export UV_FIND_LINKS := $(abspath $(WHEELHOUSE))
 endif
 
-$(READY): requirements.lock pyproject.toml
-	@if command -v uv >/dev/null 2>&1; then \
+# Installs a lock into `.venv`: $(1) the lock, $(2) how uv does it, $(3) what it is for. Installers say nothing while they
+# unpack, so every few seconds there is a word on how much has arrived. Nothing of ours opens the models of PyBullet.
+define install
+	@echo "Installing $(3) into $(VENV): $$(grep -c '^[a-z].*==' $(1)) packages, once. It takes a minute or more."
+	@while sleep 4; do echo "  $$(du -sm $(VENV) | cut -f1) MB so far"; done & saying=$$!; trap 'kill $$saying' EXIT; \
+	if command -v uv >/dev/null 2>&1; then \
 	  { uv venv -q --allow-existing --python $(PYTHON) $(VENV) || { $(NO_PYTHON); }; } && \
 	  $(SETUPTOOLS) | VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --require-hashes -r - && \
-	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip sync -q --compile-bytecode --require-hashes --no-build-isolation requirements.lock && \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip $(firstword $(2)) -q --compile-bytecode --require-hashes --no-build-isolation $(wordlist 2,2,$(2)) $(1) && \
 	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --no-deps --no-build-isolation -e . ; \
 	else \
 	  { $(IS_PYTHON) || { $(NO_PYTHON); }; } && \
 	  $(PYTHON) -m venv $(VENV) && \
 	  $(SETUPTOOLS) | $(BIN)/python -m pip install -q --require-hashes -r /dev/stdin && \
-	  $(BIN)/python -m pip install -q --require-hashes --no-build-isolation -r requirements.lock && \
+	  $(BIN)/python -m pip install -q --require-hashes --no-build-isolation -r $(1) && \
 	  $(BIN)/python -m pip install -q --no-deps --no-build-isolation -e . ; \
 	fi
+	@rm -rf $(VENV)/lib/python*/site-packages/pybullet_data
+	@touch $(SERVES)
+endef
+
+$(SERVES): requirements-serve.lock pyproject.toml
+	$(call install,requirements-serve.lock,install -r,what serving needs)
+
+$(READY): requirements.lock requirements-serve.lock pyproject.toml
+	$(call install,requirements.lock,sync,what serving and testing need)
 	@touch $@
 
 demo: $(READY)
@@ -56,7 +70,7 @@ test: $(READY)
 	wait $$types; types=$$?; cat $(VENV)/types.txt; \
 	[ $$tests -eq 0 ] && [ $$types -eq 0 ]
 
-serve: $(READY)
+serve: $(SERVES)
 	@$(BIN)/skills serve --samples
 
 # The documentation site into build/site: a dead link fails. The builder goes into the same `.venv`; the rest asks no network.
@@ -109,8 +123,8 @@ HOW := --python-version 3.11 --universal --generate-hashes --no-header --no-anno
 LOCK := uv pip compile pyproject.toml $(HOW)
 OF_TORCH := /^(torch|triton|cuda-[a-z]+|nvidia-[a-z0-9-]+)==/,/[^\\]$$/d
 lock:
-	$(LOCK) --group dev -o requirements.lock
-	$(LOCK) --group build -c requirements.lock -o requirements-serve.lock
+	$(LOCK) --extra pictures --group dev -o requirements.lock
+	$(LOCK) --extra pictures --group build -c requirements.lock -o requirements-serve.lock
 	@mkdir -p build
 	$(LOCK) --extra deep -c requirements.lock -o build/deep.lock
 	sed -E '$(OF_TORCH)' build/deep.lock > requirements-deep.lock

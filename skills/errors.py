@@ -17,7 +17,7 @@
     │   └── NotDrawnYet         a picture that is being drawn, or was not requested
     ├── Erased                  the object was erased permanently
     ├── Conflict                not possible in the present state
-    │   └── LearnerNotInstalled a learner whose optional dependencies are not installed
+    │   └── NotInstalled        an optional dependency is not installed here
     ├── PreconditionFailed      the object changed since the caller last read it
     ├── UnknownFormat           the content has no format that is read here
     ├── TooLarge                over a size limit of the settings
@@ -304,8 +304,8 @@ class BadSettings(BadInput):
     """A setting has an impossible value."""
 
 
-class LearnerNotInstalled(Conflict):
-    """The learner's optional dependencies are not installed; the same request can succeed once they are."""
+class NotInstalled(Conflict):
+    """Optional dependencies are not installed here; the same request can succeed once they are."""
 
 
 class LearningFailed(SkillsError):

@@ -121,7 +121,7 @@ def test_the_two_commands_of_the_readme_exist() -> None:
     [(_, text)] = blocks("README.md")
     make, trying = (line.split()[:2] for line in text.splitlines())
     assert (make, trying) == (["make", "serve"], ["skills", "try"])
-    assert "serve: $(READY)" in (ROOT / "Makefile").read_text()
+    assert "serve: $(SERVES)" in (ROOT / "Makefile").read_text()
     assert CliRunner().invoke(app, ["try", "--help"]).exit_code == 0
 
 

@@ -248,10 +248,10 @@ def start_job(
 ) -> Response:
     """Request a job in a transaction that locks some names, or all, and return the response to it."""
     with db.writing(names) as session:
-        job, new, did = request(session)
+        job, _, did = request(session)
         answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
-    if new:
+    if job.state == "queued":
         engine.submit(job.row, job.attempt, job.kind)
     return answer
 

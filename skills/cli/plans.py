@@ -205,7 +205,6 @@ def arm_errors_of(errors: str | None) -> Any:
 def export(
     plan_id: PlanId,
     to: Annotated[Path, typer.Argument(dir_okay=False)],
-    pass_index: Annotated[int | None, typer.Option("--pass")] = None,
     no_handoff: bool = False,
     force: bool = False,
 ) -> Answer:
@@ -213,14 +212,13 @@ def export(
 
     Args:
         to: The zip to write.
-        pass_index: A single pass, counted from 0.
         no_handoff: Needed for a plan without a hand-off: no PSM_M, no A2.
         force: Replace the file if it exists.
     """
     if to.exists() and not force:
         raise BadInput(f"{to} exists already, and may be the bag of another plan.", "Replace it: --force")
     with service() as client, bar("fetching") as progress:
-        client.save_replay_bag(plan_id, to, pass_index, progress, handoff="none" if no_handoff else None)
+        client.save_replay_bag(plan_id, to, progress, handoff="none" if no_handoff else None)
     megabytes = to.stat().st_size / 1e6
     check = f"Check it with `skills verify {to}` before it is used. Research use only."
     return written(to, f"{to}: {megabytes:.1f} MB. {check}")

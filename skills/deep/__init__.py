@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-from skills.errors import LearnerNotInstalled, LearningFailed, Unanswered
+from skills.errors import LearningFailed, NotInstalled, Unanswered
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.learning import policy as table
@@ -71,11 +71,11 @@ def require_installed(learner: Learner) -> None:
     """Refuse a learner whose libraries are not installed, before any work.
 
     Raises:
-        LearnerNotInstalled: It needs the extra `deep`.
+        NotInstalled: It needs the extra `deep`.
     """
     # `find_spec` does not import torch, which this process is to do without.
     if isinstance(learner, DQN | DDPG | TRPO) and (missing := [name for name in NEEDED if find_spec(name) is None]):
-        raise LearnerNotInstalled(
+        raise NotInstalled(
             f"The learner '{learner.kind}' needs {', '.join(missing)}, which is not installed here. Install the "
             "extra 'deep' for the service and its workers (`make deep`, or `pip install 'suture-skills[deep]'`), "
             "or choose another learner.",
@@ -111,7 +111,7 @@ def learn_policy(
 
     Raises:
         BadSettings: The seed, the levels or the settings are out of range.
-        LearnerNotInstalled: The learner needs the extra `deep`.
+        NotInstalled: The learner needs the extra `deep`.
         LearningFailed: The separate process crashed, or exceeded its time or memory.
     """
     if not isinstance(learner, DQN | DDPG | TRPO):

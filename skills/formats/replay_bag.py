@@ -1,6 +1,8 @@
-"""The replay bag for a robot or a simulator: a folder for each arm, with every sample of a plan's trajectory.
+"""The replay bag for a robot or a simulator: for each automatic segment of a plan a bag folder of each arm that moves.
 
-    Trajectory --arms_of--> ArmMotion --folder_of--> PSM1/metadata.yaml, PSM1/PSM1.mcap --seal--> one zip
+    Trajectory --arms_of--> ArmMotion --segments_of, folders_of--> 000-A1/PSM1/metadata.yaml, 000-A1/PSM1/PSM1.mcap ...
+                                      --index_of--> what comes when, who moves, and what must be true before
+    files --seal--> one zip
 
 Each arm has three topics, with one message on each of them for every sample, stamped with the sample's time:
 
@@ -8,39 +10,39 @@ Each arm has three topics, with one message on each of them for every sample, st
     /PSMn/setpoint_cp        the tip in the base frame of the arm itself, m
     /PSMn/jaw/setpoint_js    the jaw's angle, rad
 
-So `dvrk_bag_replay.py` of dvrk_python replays them unchanged. It reads a topic in the order of the bag, drops a message
-whose stamp is not later than the one before it (for the first message, than 0), and pairs the messages of the arm and
-the jaw. Here stamps equal the log times, begin at `EPOCH_NS` and strictly increase, and both topics have equally many.
+So `dvrk_bag_replay.py` of dvrk_python replays each folder unchanged. It reads a topic in the order of the bag, drops a
+message whose stamp is not later than the one before it (for the first message, than 0), and pairs the messages of the
+arm and the jaw; it cannot wait, so where somebody may wait a folder ends. Here stamps equal the log times, begin at
+`EPOCH_NS`, strictly increase, are on one clock in all folders, and both topics have equally many.
 
-Lengths here are metres, as in every bag. The same trajectory gives the same bytes.
+Lengths in the folders are metres, as in every bag. The same trajectory gives the same bytes.
 """
 
 import hashlib
 import io
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from pydantic import BaseModel
 
 from skills.arrays import Floats, Ints
-from skills.errors import BadPlan
 from skills.formats import bag_writer
 from skills.formats.archive import pack
 from skills.formats.bag_writer import Message, bag_folder
 from skills.formats.checksums import SUMS, write_sums
 from skills.formats.columns import in_metres
-from skills.kinematics import JOINTS, forward, instrument_of, quaternion_of
+from skills.kinematics import JAW_TIP_MM, JOINTS, forward, instrument_of, quaternion_of
+from skills.planning.automatic_segments import AutomaticSegment, segments_of
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD
-from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory
+from skills.schemas.plans import ArmStart, PlanSegment, Role, SegmentIndex
+from skills.verification.gates import Limits
 
 CRTK_ARMS = ("PSM1", "PSM2", "PSM3")  # the names that `dvrk_bag_replay.py -a` accepts
 EPOCH_NS = 1_000_000_000  # ours: a stamp of 0 is "invalid" to CRTK, and a plan has no date
-PAUSE_TICKS = 1.5  # stamps further apart than this many sample periods are a pause between passes
-
-Role = Literal["PSM_A", "PSM_M"]
+# An arm that begins so far off touches nothing that the verdict found clear; both angles move a jaw's tip so far.
+START_MM = Limits().clearance_psm_m_mm
+START_RAD = START_MM / JAW_TIP_MM
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +54,13 @@ class ArmMotion:
         role: PSM_A hands the needle over, PSM_M takes it.
         instrument: Number of its instrument.
         frame: The name of its base frame, in which `tip_m` is.
-        rate_hz: Samples per second within a pass.
+        rate_hz: Samples per second.
         stamps_ns: Shape (T,), strictly increasing, above 0.
         joints: Columns of `kinematics.JOINTS`, rad and m, shape (T, 6).
         tip_m: Position of the tip, shape (T, 3).
         rotation_xyzw: Rotation of the jaw, shape (T, 4).
         jaw_rad: Angle of the jaw, shape (T,).
-        pass_index: Index of the plan's pass that this is, from 0; None: all passes.
+        segment: The name of the segment that this is; "" for the whole motion.
     """
 
     name: str
@@ -71,7 +73,7 @@ class ArmMotion:
     tip_m: Floats
     rotation_xyzw: Floats
     jaw_rad: Floats
-    pass_index: int | None
+    segment: str = ""
 
     @property
     def topics(self) -> tuple[str, str, str]:
@@ -79,9 +81,57 @@ class ArmMotion:
         return f"/{self.name}/setpoint_js", f"/{self.name}/setpoint_cp", f"/{self.name}/jaw/setpoint_js"
 
     @property
-    def extent_mm(self) -> Floats:
-        """The bounding box of its tip, lowest and highest corner, shape (2, 3), as the robot's own script prints it."""
-        return 1000.0 * np.stack([self.tip_m.min(axis=0), self.tip_m.max(axis=0)])
+    def place(self) -> str:
+        """Its folder in the bag, or its name for the whole motion."""
+        return f"{self.segment}/{self.name}" if self.segment else self.name
+
+    @property
+    def moves(self) -> bool:
+        """Whether a joint or the jaw moves."""
+        return bool((self.joints != self.joints[0]).any() or (self.jaw_rad != self.jaw_rad[0]).any())
+
+    def part(self, samples: slice, segment: str) -> "ArmMotion":
+        """Return some of its samples, as a segment."""
+        return replace(
+            self,
+            segment=segment,
+            stamps_ns=self.stamps_ns[samples],
+            joints=self.joints[samples],
+            tip_m=self.tip_m[samples],
+            rotation_xyzw=self.rotation_xyzw[samples],
+            jaw_rad=self.jaw_rad[samples],
+        )
+
+    def start(self, sample: int, *, moves: bool) -> ArmStart:
+        """Return where it stands in a sample, before a segment in which it moves or not."""
+        return ArmStart(
+            arm=self.name,
+            role=self.role,
+            moves=moves,
+            frame=self.frame,
+            position_mm=(1000.0 * self.tip_m[sample]).tolist(),
+            rotation_xyzw=self.rotation_xyzw[sample].tolist(),
+            jaw_rad=float(self.jaw_rad[sample]),
+        )
+
+    @property
+    def box(self) -> list[tuple[str, float, float]]:
+        """The lowest and the highest coordinate of its tip along each axis, in mm, as the robot's own script has it."""
+        low, high = (1000.0 * ends for ends in (self.tip_m.min(axis=0), self.tip_m.max(axis=0)))
+        return list(zip("XYZ", low.tolist(), high.tolist(), strict=True))
+
+
+def joined(parts: Sequence[ArmMotion]) -> ArmMotion:
+    """Return parts of an arm's motion as one."""
+    return replace(
+        parts[0],
+        segment="",
+        stamps_ns=np.concatenate([part.stamps_ns for part in parts]),
+        joints=np.concatenate([part.joints for part in parts]),
+        tip_m=np.concatenate([part.tip_m for part in parts]),
+        rotation_xyzw=np.concatenate([part.rotation_xyzw for part in parts]),
+        jaw_rad=np.concatenate([part.jaw_rad for part in parts]),
+    )
 
 
 def arm_names(arm: str, other: str | None = None) -> tuple[str, str]:
@@ -121,7 +171,6 @@ def arms_of(
     frame: str,
     other: str | None = None,
     jaw_rad: float = JAW_CLOSED_RAD,
-    pass_index: int | None = None,
 ) -> tuple[ArmMotion, ...]:
     """Return the setpoints of each arm of a trajectory: PSM_A, and PSM_M if its pose is known.
 
@@ -131,13 +180,8 @@ def arms_of(
         frame: The plan's frame.
         other: The arm that took the needle in the demonstration.
         jaw_rad: The angle of PSM_A's jaw, if the trajectory has none.
-        pass_index: A single pass, counted from 0 as in reports; its samples keep their stamps. None: all passes.
-
-    Raises:
-        BadPlan: There is no such pass.
     """
-    rows = rows_of_pass(trajectory, pass_index)
-    stamps_ns = EPOCH_NS + np.rint(trajectory.stamps_s[rows] * 1e9).astype(np.int64)
+    stamps_ns = EPOCH_NS + np.rint(trajectory.stamps_s * 1e9).astype(np.int64)
     names = arm_names(arm, other)
     psm_a = ArmMotion(
         name=names[0],
@@ -146,16 +190,15 @@ def arms_of(
         frame=frame,
         rate_hz=trajectory.rate_hz,
         stamps_ns=stamps_ns,
-        joints=in_metres(trajectory.joints[rows]),
-        tip_m=trajectory.tip_mm[rows] / 1000.0,
-        rotation_xyzw=trajectory.rotation_xyzw[rows],
-        jaw_rad=np.full(len(rows), jaw_rad) if trajectory.jaw_rad is None else trajectory.jaw_rad[rows],
-        pass_index=pass_index,
+        joints=in_metres(trajectory.joints),
+        tip_m=trajectory.tip_mm / 1000.0,
+        rotation_xyzw=trajectory.rotation_xyzw,
+        jaw_rad=np.full(len(trajectory), jaw_rad) if trajectory.jaw_rad is None else trajectory.jaw_rad,
     )
     psm_m = trajectory.psm_m
     if psm_m is None:
         return (psm_a,)
-    tip_mm, rotation = forward(psm_m.joints[rows], psm_m.instrument)
+    tip_mm, rotation = forward(psm_m.joints, psm_m.instrument)
     return psm_a, ArmMotion(
         name=names[1],
         role="PSM_M",
@@ -163,52 +206,34 @@ def arms_of(
         frame=f"{names[1]}_base",
         rate_hz=trajectory.rate_hz,
         stamps_ns=stamps_ns,
-        joints=in_metres(psm_m.joints[rows]),
+        joints=in_metres(psm_m.joints),
         tip_m=tip_mm / 1000.0,
         rotation_xyzw=quaternion_of(rotation),
-        jaw_rad=np.full(len(rows), JAW_OPEN_RAD) if psm_m.jaw_rad is None else psm_m.jaw_rad[rows],
-        pass_index=pass_index,
+        jaw_rad=np.full(len(trajectory), JAW_OPEN_RAD) if psm_m.jaw_rad is None else psm_m.jaw_rad,
     )
 
 
-def rows_of_pass(trajectory: Trajectory, pass_index: int | None) -> Ints:
-    """Return the indices of the samples of one pass, or of all samples.
+def velocities_of(stamps_ns: Ints, joints: Floats) -> Floats:
+    """Return joint velocities, shape (T, N): central differences, and 0 at both ends of a segment.
 
-    Raises:
-        BadPlan: There is no such pass.
-    """
-    if pass_index is None:
-        return np.arange(len(trajectory))
-    if not 0 <= pass_index < trajectory.passes:
-        raise BadPlan(f"The plan's passes are 0 to {trajectory.passes - 1}.", **{"pass": pass_index})
-    return np.flatnonzero(trajectory.pass_index == pass_index)
-
-
-def velocities_of(stamps_ns: Ints, joints: Floats, rate_hz: float) -> Floats:
-    """Return joint velocities, shape (T, N): central differences, and 0 at both ends of every stretch without a pause.
-
-    At those ends the arm is at rest, and a controller may continue with the last commanded velocity until it receives
-    the next setpoint.
+    There the arm is at rest, and a controller may continue with the last commanded velocity until it receives the next
+    setpoint.
 
     Args:
-        stamps_ns: Shape (T,).
+        stamps_ns: Of one segment, shape (T,).
         joints: Shape (T, N).
-        rate_hz: Samples per second without pauses; steps longer than `PAUSE_TICKS` samples are pauses.
     """
     velocities = np.zeros_like(joints)
-    goes_on = np.diff(stamps_ns) <= PAUSE_TICKS * 1e9 / rate_hz
-    within = (goes_on[:-1] & goes_on[1:])[:, None]
-    seconds = (stamps_ns[2:] - stamps_ns[:-2])[:, None] / 1e9
-    velocities[1:-1] = np.where(within, (joints[2:] - joints[:-2]) / seconds, 0.0)
+    velocities[1:-1] = (joints[2:] - joints[:-2]) / ((stamps_ns[2:] - stamps_ns[:-2])[:, None] / 1e9)
     return velocities
 
 
 def messages_of(motion: ArmMotion) -> Iterator[Message]:
     """Yield an arm's messages: for each sample the joints, the tip and the jaw."""
     on_joints, on_tip, on_jaw = motion.topics
-    velocities = velocities_of(motion.stamps_ns, motion.joints, motion.rate_hz)
+    velocities = velocities_of(motion.stamps_ns, motion.joints)
     jaws = motion.jaw_rad[:, None]
-    turning = velocities_of(motion.stamps_ns, jaws, motion.rate_hz)
+    turning = velocities_of(motion.stamps_ns, jaws)
     columns = (motion.stamps_ns, motion.joints, velocities, motion.tip_m, motion.rotation_xyzw, jaws, turning)
     for stamp_ns, joints, speeds, tip_m, turn, jaw, rate in zip(*(one.tolist() for one in columns), strict=True):
         yield bag_writer.joint_state(on_joints, stamp_ns, joints, JOINTS, velocities=speeds)
@@ -217,113 +242,64 @@ def messages_of(motion: ArmMotion) -> Iterator[Message]:
 
 
 def folder_of(motion: ArmMotion, plan_sha256: str) -> dict[str, bytes]:
-    """Return the files of an arm's bag folder; the MCAP file has `notes_of` as metadata."""
-    return bag_folder(messages_of(motion), motion.name, notes_of(motion, plan_sha256))
+    """Return the files of an arm's bag folder in a segment; the MCAP file has `notes_of` as metadata."""
+    made = bag_folder(messages_of(motion), motion.name, notes_of(motion, plan_sha256))
+    return {f"{motion.segment}/{name}": data for name, data in made.items()}
+
+
+def parts_of(trajectory: Trajectory, arms: Sequence[ArmMotion]) -> list[tuple[AutomaticSegment, list[ArmMotion]]]:
+    """Return each segment with what each arm does in it."""
+    return [
+        (one, [arm.part(one.samples, f"{number:03d}-{one.kind}") for arm in arms])
+        for number, one in enumerate(segments_of(trajectory))
+    ]
+
+
+def index_of(trajectory: Trajectory, arms: Sequence[ArmMotion], plan_sha256: str) -> SegmentIndex:
+    """Return what comes when, who moves, and what must be true before each segment.
+
+    Args:
+        trajectory: The one that `arms` are made of.
+        arms: The result of `arms_of`.
+        plan_sha256: The digest of the plan.
+    """
+    return SegmentIndex(
+        plan=plan_sha256,
+        position_tolerance_mm=START_MM,
+        rotation_tolerance_rad=START_RAD,
+        jaw_tolerance_rad=START_RAD,
+        segments=[
+            PlanSegment(
+                name=parts[0].segment,
+                kind=one.kind,
+                pass_index=one.pass_index,
+                from_ns=int(parts[0].stamps_ns[0]),
+                to_ns=int(parts[0].stamps_ns[-1]),
+                by_hand=list(one.by_hand),
+                teleoperated=[arm.name for arm in arms] if one.by_hand else [],
+                needle_held_by=held_by(one.kind, len(arms)),
+                arms=[part.start(0, moves=part.moves) for part in parts],
+            )
+            for one, parts in parts_of(trajectory, arms)
+        ],
+    )
+
+
+def held_by(kind: str, arms: int) -> Role | None:
+    """Return the arm that holds the needle before a segment; None if it is not planned."""
+    return "PSM_A" if kind != "transfer" else "PSM_M" if arms > 1 else None
 
 
 def notes_of(motion: ArmMotion, plan_sha256: str) -> dict[str, str]:
     """Return the notes in an arm's file: its plan, and the parameters that are needed to verify it."""
     return {
         "plan": plan_sha256,
-        "pass": "all" if motion.pass_index is None else str(motion.pass_index),
+        "segment": motion.segment,
         "role": motion.role,
         "instrument": motion.instrument,
         "rate_hz": repr(motion.rate_hz),
         "use": "research use only",
     }
-
-
-class PhaseTimes(BaseModel):
-    """A phase of a pass: its first and its last stamp."""
-
-    phase: str
-    from_ns: int
-    to_ns: int
-
-
-class JawMove(BaseModel):
-    """The motion of one arm's jaw: its last angle, and the stamps between which it moves."""
-
-    arm: str
-    jaw_rad: float
-    from_ns: int
-    to_ns: int
-
-
-class HandOver(BaseModel):
-    """The needle's change from one arm to the other: the stamp at which the arms stand, and the jaws in their order."""
-
-    at_ns: int
-    jaws_in_order: list[JawMove]
-
-
-class PassTimes(BaseModel):
-    """A pass on the clock of the setpoints.
-
-    PSM_M takes the needle in `hand_over`, at the end of A2. PSM_A has it again after `take_back`, at the end of a
-    transfer; before its `at_ns` the surgeon inserts the needle and takes it (M1, M2). None where the jaws do not move.
-    """
-
-    index: int
-    phases: list[PhaseTimes]
-    hand_over: HandOver | None
-    take_back: HandOver | None = None
-
-
-class ExecutorTimetable(BaseModel):
-    """The passes of a bag on the one clock of its setpoints, for a program or a person that executes it.
-
-    Attributes:
-        plan: The SHA-256 of the plan.
-        use: The limits of its use.
-        before_each_pass: Instructions to the person.
-        passes: The passes.
-    """
-
-    plan: str
-    use: str = ""
-    before_each_pass: str = ""
-    passes: list[PassTimes]
-
-
-def pass_times(trajectory: Trajectory, arms: tuple[ArmMotion, ...]) -> list[PassTimes]:
-    """Return the times of each pass of a bag.
-
-    Args:
-        trajectory: The one that the bag is made of.
-        arms: The result of `arms_of` for it.
-    """
-    rows = rows_of_pass(trajectory, arms[0].pass_index)
-    stamps_ns, number, phase = arms[0].stamps_ns, trajectory.pass_index[rows], trajectory.phase[rows]
-    found = []
-    for one in np.unique(number).tolist():
-        parts = [(name, stamps_ns[(number == one) & (phase == k)].tolist()) for k, name in enumerate(PHASES)]
-        transfer = np.flatnonzero((number == one) & (phase == TRANSFER))
-        found.append(
-            PassTimes(
-                index=one,
-                phases=[PhaseTimes(phase=name, from_ns=ns[0], to_ns=ns[-1]) for name, ns in parts if ns],
-                hand_over=_hand_over(arms, np.flatnonzero((number == one) & (phase == A2))),
-                # with the sample after them, where the jaws' motion ends
-                take_back=_hand_over(arms, np.append(transfer, transfer[-1:] + 1)),
-            )
-        )
-    return found
-
-
-def _hand_over(arms: tuple[ArmMotion, ...], rows: Ints) -> HandOver | None:
-    """Return when each jaw moves in some samples of a bag; None unless both do."""
-    moves = []
-    for arm in arms:
-        steps = np.flatnonzero(np.diff(arm.jaw_rad[rows]) != 0)
-        if len(steps):
-            first, last = rows[steps[0]], rows[steps[-1] + 1]
-            from_ns, to_ns = arm.stamps_ns[[first, last]].tolist()
-            moves.append(JawMove(arm=arm.name, jaw_rad=float(arm.jaw_rad[last]), from_ns=from_ns, to_ns=to_ns))
-    if len(moves) < 2:
-        return None
-    moves.sort(key=lambda move: (move.from_ns, move.to_ns, move.arm))
-    return HandOver(at_ns=moves[0].from_ns, jaws_in_order=moves)
 
 
 def seal(members: Mapping[str, bytes]) -> bytes:

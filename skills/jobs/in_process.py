@@ -15,6 +15,7 @@ from skills.jobs import Engine
 from skills.jobs.attempts import Work
 from skills.jobs.readiness import live_workers
 from skills.library.operation.jobs import ACTIVE, BATCH, PART, PICTURES
+from skills.settings import Settings
 
 LOOK_S = 0.5  # between two looks for jobs that this process did not request
 
@@ -22,12 +23,17 @@ LOOK_S = 0.5  # between two looks for jobs that this process did not request
 class InProcess(Engine):
     """Performs the jobs of an installation one after the other, the newest first, where it has no live worker.
 
-    Parts of batches and pictures are left to workers, which find them when there are some. A worker that starts
-    meanwhile may perform a job too: of two attempts the first that ends is stored.
+    Parts of batches, and pictures that the command does not ask for, are left to workers, which find them when there
+    are some. A worker that starts meanwhile may perform a job too: of two attempts the first that ends is stored.
     """
 
+    def __init__(self, settings: Settings) -> None:
+        self._requested: list[int] = []
+        super().__init__(settings)
+
     def submit(self, row: int, attempt: int, kind: str) -> None:
-        """Look for jobs now."""
+        """Perform a job, and look for others."""
+        self._requested.append(row)
         self._calls.put(lambda _: None)
 
     def cancel(self, row: int, attempt: int) -> None:
@@ -45,7 +51,7 @@ class InProcess(Engine):
 
     def _newest(self, database: Database) -> tuple[int, int] | None:
         """Return the row and the attempt of the newest job to perform here, if there is one."""
-        mine = Job.state.in_(ACTIVE), Job.kind.not_in((BATCH, PART, PICTURES))
+        mine = Job.state.in_(ACTIVE), Job.kind.not_in((BATCH, PART, PICTURES)) | Job.row.in_(self._requested)
         with database.reading() as session:
             newest = session.execute(select(Job.row, Job.attempt).where(*mine).order_by(Job.row.desc())).first()
         return (

@@ -59,6 +59,7 @@ _ATTEMPTS = 20
 Paces = tuple[motion_laws.Pace, motion_laws.Pace, motion_laws.Pace]  # of each phase
 
 
+STANDS = 1e-6  # ours, rad and mm: joints that differ by no more are those of one pose
 PSM_A, PSM_M = "PSM_A", "PSM_M"  # the names of the two arms: the one that hands over, and the one that takes
 
 
@@ -227,7 +228,7 @@ def time_parametrise(
             of PSM_M; lower in bends, and lower if the joints' limits require it.
         rate_hz: Samples per second.
         instrument: Number of the instrument.
-        pause_s: Seconds between passes, for M1 and M2 by hand; rounded to full ticks, at least one.
+        pause_s: Seconds between passes, for M1 and M2 by hand; rounded to full ticks, at least two.
         psm_m: The other arm; if its base is known it moves too.
 
     Returns:
@@ -245,6 +246,13 @@ def time_parametrise(
     _check_rate(rate_hz)
     if not (isfinite(pause_s) and 0 <= pause_s <= 3600):
         raise BadSpeed("The pause between passes must be 0 to 3600 s.", pause_s=pause_s)
+    pause = round(pause_s * rate_hz)
+    if len(passes) > 1 and pause < 2:
+        raise BadSpeed(
+            f"A pause of {pause_s:g} s between passes is shorter than two samples at {rate_hz:g} Hz: nobody inserts "
+            "and grasps the needle in it. The usual one is 1 s.",
+            pause_s=pause_s,
+        )
     routes = lay_out(passes, psm_m)
     peak_mm_s = _peak_mm_s(routes)
     tempo = 1.0 if peak_mm_s <= speed_mm_s else speed_mm_s / peak_mm_s
@@ -258,7 +266,6 @@ def time_parametrise(
         paces = slower
     else:
         raise BadSpeed("No speed keeps this plan within the joints' limits; move it away from the limits of the wrist.")
-    pause = max(1, round(pause_s * rate_hz))  # at least one tick, because stamps must increase
     ticks = motion.ticks
     handed = routes[0].hand is not None
     return Trajectory(
@@ -544,6 +551,33 @@ class Seam:
     leap_mm: float
     leap_deg: float
     joint_leap: float
+
+
+def rows_of_pass(trajectory: Trajectory, pass_index: int | None) -> Ints:
+    """Return the indices of the samples of one pass, or of all samples.
+
+    Raises:
+        BadPlan: There is no such pass.
+    """
+    if pass_index is None:
+        return np.arange(len(trajectory))
+    if not 0 <= pass_index < trajectory.passes:
+        raise BadPlan(f"The plan's passes are 0 to {trajectory.passes - 1}.", **{"pass": pass_index})
+    return np.flatnonzero(trajectory.pass_index == pass_index)
+
+
+def stands_from(trajectory: Trajectory, end: int) -> int:
+    """Return the first of the samples up to an end at which both arms stand as they do there.
+
+    Args:
+        trajectory: The motion.
+        end: The index of a sample; NaN stands nowhere else.
+    """
+    moved = np.zeros(end + 1, bool)
+    for arm in trajectory.arms:
+        moved |= ~(np.abs(arm.joints[: end + 1] - arm.joints[end]) <= STANDS).all(axis=1)
+    moved[end] = False
+    return end - int(np.argmax(np.append(moved[::-1], True))) + 1
 
 
 def seconds_by_phase(trajectory: Trajectory) -> dict[str, float]:

@@ -12,6 +12,7 @@ from pydantic import Field, StrictInt
 from skills.fields import Count, Point, Quaternion, Sha256, Slug
 from skills.gridworld.scene import Scene
 from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
+from skills.planning.automatic_segments import HandTask, SegmentKind
 from skills.planning.handoff import Enters
 from skills.planning.plan import (
     MAX_OUTSIDE_MM,
@@ -192,6 +193,63 @@ class Timetable(Given):
     deviation_mm: float
     psm_m_moves: bool
     seams: list[Seam]
+
+
+Role = Literal["PSM_A", "PSM_M"]  # PSM_A hands the needle over, PSM_M takes it
+
+
+class ArmStart(Given):
+    """Where an arm must stand before a segment.
+
+    Attributes:
+        moves: Whether it moves in the segment; if not, it must stand there all the same.
+        frame: Its own base, in which the pose is.
+        position_mm: The jaw's hinge.
+    """
+
+    arm: str
+    role: Role
+    moves: bool
+    frame: str
+    position_mm: Point
+    rotation_xyzw: Quaternion
+    jaw_rad: float
+
+
+class PlanSegment(Given):
+    """A segment that the arms do by themselves, and what must be true before it.
+
+    Attributes:
+        name: Its folder in the replay bag.
+        from_ns: Its first stamp, on the one clock of the bag's setpoints.
+        by_hand: What the surgeon does before it, without a limit of time: M1 inserts the needle, M2 grasps it again.
+        teleoperated: The arms that the surgeon teleoperates meanwhile; in all segments no arm is.
+        needle_held_by: Before it; null where that is not planned.
+    """
+
+    name: str
+    kind: SegmentKind
+    pass_index: Count
+    from_ns: Count
+    to_ns: Count
+    by_hand: list[HandTask]
+    teleoperated: list[str]
+    needle_held_by: Role | None
+    arms: list[ArmStart]
+
+
+class SegmentIndex(Given):
+    """The automatic segments of a plan in their order; between two of them an execution may wait.
+
+    Attributes:
+        position_tolerance_mm: How far an arm may stand from its place before a segment.
+    """
+
+    plan: Sha256
+    position_tolerance_mm: float
+    rotation_tolerance_rad: float
+    jaw_tolerance_rad: float
+    segments: list[PlanSegment]
 
 
 class PlanScene(Given):

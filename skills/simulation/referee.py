@@ -44,7 +44,7 @@ from skills.errors import BadInput, BadSettings, SimulationFailed
 from skills.kinematics import JAW_TIP_MM, matrix_of, quaternion_of
 from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, NEEDLE_RADIUS_MM, OPEN_RAD
 from skills.planning.motion_laws import A2, PEAK
-from skills.planning.trajectory import Trajectory
+from skills.planning.trajectory import Trajectory, stands_from
 from skills.quaternions import vector_of
 from skills.sandbox import ProcessLimits
 from skills.simulation.player import simulated
@@ -58,7 +58,6 @@ from skills.verification.clearance import (
     needle_arc_mm,
     needle_poses,
     psm_m_poses,
-    stands_from,
 )
 from skills.verification.error_draws import Displaced, Drawn, draw
 from skills.verification.monte_carlo import at_hand_off, caught_by, scene_of

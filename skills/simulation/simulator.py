@@ -23,10 +23,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import version
-from importlib.resources import as_file, files
+from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -275,8 +276,11 @@ class Simulator:
         wrist_mm: float | None = None,
     ) -> int:
         """Load a file of the scene, note its digest, and return the number of its body."""
-        with _file(name, wrist_mm) as path:
-            self.files[name] = sha256(path.read_bytes()).hexdigest()
+        text = (files("skills") / "urdf" / name).read_text()
+        self.files[name] = sha256(text.encode()).hexdigest()
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            path.write_text(text if wrist_mm is None else arm_in_capsules(text, wrist_mm))
             return int(
                 self.bullet.loadURDF(
                     str(path),
@@ -316,21 +320,20 @@ class Simulator:
         return arm
 
 
-@contextmanager
-def _file(name: str, wrist_mm: float | None) -> Iterator[Path]:
-    """Give a file of the scene; an arm's with its remote centre where the wrist's offset, in mm, is this one."""
-    with as_file(files("skills") / "urdf" / name) as path:
-        if wrist_mm is None or abs(wrist_mm - URDF_WRIST_MM) < 1e-6:
-            yield path
-            return
-        centre_mm = (URDF_CENTRE_MM, URDF_CENTRE_MM + wrist_mm - URDF_WRIST_MM)
-        before, after = (f'"0 {up_mm * MM:.4f} 0"' for up_mm in centre_mm)
-        text = path.read_text()
-        assert text.count(before) == 1
-        with TemporaryDirectory() as folder:
-            moved = Path(folder) / name
-            moved.write_text(text.replace(before, after))
-            yield moved
+def arm_in_capsules(text: str, wrist_mm: float) -> str:
+    """Return the file of an arm with its remote centre where the wrist's offset is this one, and with capsules.
+
+    A capsule is PyBullet's own word for a cylinder with a sphere at either end, twice as fast and exact.
+    """
+    before, after = (f'"0 {(URDF_CENTRE_MM + more_mm) * MM:.4f} 0"' for more_mm in (0.0, wrist_mm - URDF_WRIST_MM))
+    assert text.count(before) == 1
+    root = ElementTree.fromstring(text.replace(before, after))  # noqa: S314 - a file of the package
+    for link in root.iter("link"):
+        for end in link.findall("collision")[1:]:
+            link.remove(end)
+        for cylinder in link.findall("collision/geometry/cylinder"):
+            cylinder.tag = "capsule"
+    return ElementTree.tostring(root, "unicode")
 
 
 def in_metres(joints: Floats) -> Floats:

@@ -51,7 +51,6 @@ from skills.verification.playback import LINKS, PAD_SIZE_MM, LinkPair, pad_scale
 SHAFT_RADIUS_MM = 4.0
 WRIST_REACH_MM = WRIST_MM + 3.6
 FINGER_REACH_MM = 10.3  # the tip's cap is 10.22 from the hinge
-STANDS = 1e-6  # ours, rad and mm: joints that differ by no more are those of one pose
 RADIUS_MM = 0.33  # of the needle's wire, as in `urdf/needle.urdf`
 # The arc from the place where it is held, two thirds from the tip: x along the needle, y towards the arc's centre.
 _TURN = np.linspace(-pi / 3, 2 * pi / 3, 49)
@@ -102,20 +101,6 @@ def openings(arm: PlannedArm, unplanned_rad: float = HOLDING_RAD) -> Floats:
     if arm.jaw_rad is None:
         return np.full(len(arm.joints), unplanned_rad)
     return np.maximum(arm.jaw_rad / 2, HOLDING_RAD)
-
-
-def stands_from(trajectory: Trajectory, end: int) -> int:
-    """Return the first of the samples up to an end at which both arms stand as they do there.
-
-    Args:
-        trajectory: The motion.
-        end: The index of a sample; NaN stands nowhere else.
-    """
-    moved = np.zeros(end + 1, bool)
-    for arm in trajectory.arms:
-        moved |= ~(np.abs(arm.joints[: end + 1] - arm.joints[end]) <= STANDS).all(axis=1)
-    moved[end] = False
-    return end - int(np.argmax(np.append(moved[::-1], True))) + 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from skills.arrays import Flags, Floats
 from skills.fields import Count, Figure, schema
 from skills.planning.handoff import HOLDING_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
-from skills.planning.trajectory import PSM_A, PSM_M, Trajectory, joint_ratios
+from skills.planning.trajectory import PSM_A, PSM_M, Trajectory, joint_ratios, stands_from
 from skills.verification import clearance
 from skills.verification.bodies import BodiesClearance
 from skills.verification.deviations import LIMITS, Deviations
@@ -329,7 +329,7 @@ def _handing_over(trajectory: Trajectory, apart: Floats, limit: float) -> Flags:
     """
     may = np.zeros(len(trajectory), dtype=bool)
     for end in trajectory.last_samples[trajectory.phase[trajectory.last_samples] == A2]:
-        may[clearance.stands_from(trajectory, int(end)) : end + 1] = True
+        may[stands_from(trajectory, int(end)) : end + 1] = True
         parted = (trajectory.phase[end + 1 :] != TRANSFER) | ~(apart[end + 1 :] < limit)
         may[end : end + 1 + int(np.argmax(np.append(parted, True)))] = True
     return may

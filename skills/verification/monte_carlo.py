@@ -47,7 +47,7 @@ from skills.errors import BadInput, BadSettings
 from skills.fields import Point
 from skills.planning.handoff import HELD_MM, HOLDING_RAD, hand_off
 from skills.planning.motion_laws import Pose
-from skills.planning.trajectory import A2, PSM_M, PlannedArm, Trajectory
+from skills.planning.trajectory import A2, PSM_M, STANDS, PlannedArm, Trajectory
 from skills.verification import clearance
 from skills.verification.arm_errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors
 from skills.verification.bodies import too_near
@@ -154,7 +154,7 @@ class PlannedPass:
     @property
     def handing_over(self) -> Flags:
         """Samples, (S,), in which fingers may touch fingers: the end of A2, where all arms stand as in the last one."""
-        stands = [(np.abs(arm.joints - arm.joints[-1]) <= clearance.STANDS).all(axis=1) for arm in self.arms]
+        stands = [(np.abs(arm.joints - arm.joints[-1]) <= STANDS).all(axis=1) for arm in self.arms]
         there = np.logical_and.reduce([self.phase == A2, *stands])
         return np.asarray(np.logical_and.accumulate(there[::-1])[::-1])
 

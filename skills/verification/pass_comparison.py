@@ -17,8 +17,7 @@ from skills.learning.policy import rollout
 from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, NEEDLE_RADIUS_MM, TAKEN_MM
 from skills.planning.motion_laws import A1, A2, TRANSFER, Poses
 from skills.planning.passes import STAND_OFF_MM
-from skills.planning.trajectory import Trajectory
-from skills.verification.clearance import stands_from
+from skills.planning.trajectory import Trajectory, stands_from
 from skills.verification.deviations import LIMITS, Deviations
 from skills.verification.recorded_hand import REST_S, RecordedHand
 from skills.verification.requested import RequestedMotion

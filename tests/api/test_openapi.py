@@ -24,7 +24,7 @@ OPERATIONS = {
     "get_job", "get_joints_plot", "get_nearest", "get_path", "get_picture", "get_plan", "get_playback", "get_policy",
     "get_pose_style", "get_policy_card", "get_policy_card_signature", "get_policy_signature", "get_policy_version",
     "get_policy_version_card", "get_recording", "get_report", "get_retraining",
-    "get_reward_map", "get_surgeon", "get_suture_type", "get_timeline", "get_trajectory", "get_version",
+    "get_reward_map", "get_segments", "get_surgeon", "get_suture_type", "get_timeline", "get_trajectory", "get_version",
     "list_all_keys", "list_demos", "list_jobs", "list_policies", "list_plans", "list_proposals",
     "list_recordings",
     "list_surgeons", "list_suture_types",

@@ -103,7 +103,7 @@ def test_without_the_extra_tables_are_learnt_and_networks_name_their_needs():
         "print(skills.learn_policy(reward, skills.PhaseQLearning()).replay.states.tolist())\n"
         "try:\n"
         "    skills.learn_policy(reward, skills.DQN())\n"
-        "except skills.errors.LearnerNotInstalled as refused:\n"
+        "except skills.errors.NotInstalled as refused:\n"
         "    print(refused)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -129,7 +129,7 @@ def test_the_service_refuses_it_before_there_is_a_job(still: Service, kind: str)
     before = still.counts()["jobs"]
     for call, body in (("/trainings", KESTREL), ("/retrainings", {})):
         problem = assert_problem(still.http.post(call, json={**body, "learner": {"kind": kind}}), 409)
-        assert problem["type"] == "urn:suture-skills:learner-not-installed"
+        assert problem["type"] == "urn:suture-skills:not-installed"
         assert "Install the extra 'deep'" in problem["detail"] and kind in problem["detail"]
         assert problem["numbers"]["missing"] == [*NEEDED]
     assert still.counts()["jobs"] == before

@@ -3,13 +3,14 @@
 import io
 import json
 import zipfile
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, pass_times, seal
+from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, index_of, parts_of, seal
 from skills.formats.verify import JUDGED, verify_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
@@ -18,6 +19,8 @@ from skills.planning.trajectory import A1, A2, Trajectory, joint_ratios
 
 RATE_HZ = 200.0
 FRAME = "PSM2_base"
+PARTS = ("000-A1", "001-A2", "002-A1", "003-A2")
+SHARING = (1, 3)  # those that begin with the last sample of the one before
 PSM2 = ("/PSM2/setpoint_js", "/PSM2/setpoint_cp", "/PSM2/jaw/setpoint_js")
 PSM1 = ("/PSM1/setpoint_js", "/PSM1/setpoint_cp", "/PSM1/jaw/setpoint_js")
 
@@ -91,28 +94,29 @@ def papers(made: Trajectory, **changes: Any) -> dict[str, bytes]:
         "report": report,
     } | changes.get("verdict", {})
     policy = {"version": 3, "sha256": "2" * 64} | changes.get("policy", {})
-    arms = arms_of(made, arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
-    executor = {"plan": "1" * 64, "passes": timetable(made, arms)} | changes.get("executor", {})
-    files = {"plan.json": plan, "verdict.json": verdict, "policy.json": policy, "executor.json": executor}
+    index = index_of(made, arms(made), "1" * 64).model_dump(mode="json") | changes.get("index", {})
+    files = {"plan.json": plan, "verdict.json": verdict, "policy.json": policy, "segments.json": index}
     return {name: json.dumps(paper).encode() for name, paper in files.items()} | {"README.txt": b"Read me.\n"}
 
 
 @cache
-def members(pass_index: int | None = None) -> dict[str, bytes]:
+def members() -> dict[str, bytes]:
     """Return the files of a complete bag, without their checksums."""
-    arms = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=pass_index)
-    folders = [folder_of(arm, "1" * 64) for arm in arms]
-    executor = {"plan": "1" * 64, "passes": timetable(trajectory(), arms)}
-    return papers(trajectory(), executor=executor) | folders[0] | folders[1]
+    return papers(trajectory()) | folders(trajectory(), arms(trajectory()))
 
 
-def timetable(made: Trajectory, arms: tuple[ArmMotion, ...]) -> list[dict[str, Any]]:
-    """Return the passes of a timetable as JSON."""
-    return [one.model_dump() for one in pass_times(made, arms)]
+def arms(made: Trajectory) -> tuple[ArmMotion, ...]:
+    return arms_of(made, arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
+
+
+def folders(made: Trajectory, moving: Sequence[ArmMotion], plan: str = "1" * 64) -> dict[str, bytes]:
+    """Return the files of the arms in each segment."""
+    moved = (part for _, parts in parts_of(made, moving) for part in parts if part.moves)
+    return {name: data for part in moved for name, data in folder_of(part, plan).items()}
 
 
 def arm(name: str = "PSM2") -> ArmMotion:
-    return next(one for one in arms_of(trajectory(), arm="PSM2", frame=FRAME, jaw_rad=0.1) if one.name == name)
+    return next(one for one in arms(trajectory()) if one.name == name)
 
 
 def checked(files: dict[str, bytes]) -> list[str]:

@@ -12,12 +12,27 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from skills.errors import BadBag, BadPlan
+from skills.errors import BadBag, BadSpeed
 from skills.formats import replay_bag
 from skills.kinematics import forward
+from skills.planning.automatic_segments import segments_of
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, OPEN_RAD
 from skills.planning.trajectory import time_parametrise
-from tests.formats.replays import FRAME, PSM1, PSM2, RATE_HZ, arm, checked, members, papers, trajectory, unpacked
+from tests.formats.replays import (
+    FRAME,
+    PARTS,
+    PSM1,
+    PSM2,
+    RATE_HZ,
+    SHARING,
+    arms,
+    checked,
+    folders,
+    members,
+    papers,
+    trajectory,
+    unpacked,
+)  # fmt: skip
 from tests.planning.motions import hand_off
 from tests.planning.test_trajectory import BESIDE
 
@@ -53,8 +68,8 @@ def by_mcap_ros2(folder: Path) -> list[tuple[str, Any]]:
 @pytest.mark.parametrize("read", [by_rosbags, by_mcap_ros2])
 @pytest.mark.parametrize("topics", [PSM2, PSM1])
 def test_the_robots_script_keeps_every_sample_of_the_trajectory_exactly(tmp_path, read, topics):
-    made, folder = trajectory(), unpacked(tmp_path, members())
-    said = read(folder / topics[0].split("/")[1])
+    made, folder, name = trajectory(), unpacked(tmp_path, members()), topics[0].split("/")[1]
+    said = [one for number, part in enumerate(PARTS) for one in read(folder / part / name)[3 * (number in SHARING) :]]
     assert {name for name, _ in said} == set(topics)
     (joints, no_joints), (tips, no_tips), (jaws, no_jaws) = (kept_by_the_robots_script(said, topic) for topic in topics)
     assert (no_joints, no_tips, no_jaws) == (0, 0, 0)
@@ -81,17 +96,17 @@ def test_the_robots_script_keeps_every_sample_of_the_trajectory_exactly(tmp_path
 
 
 def test_the_robots_script_waits_between_setpoints_as_planned(tmp_path):
-    kept, _ = kept_by_the_robots_script(by_rosbags(unpacked(tmp_path, members()) / "PSM2"), PSM2[0])
+    kept, _ = kept_by_the_robots_script(by_rosbags(unpacked(tmp_path, members()) / "000-A1" / "PSM2"), PSM2[0])
     stamps_s = np.array([one.header.stamp.sec + one.header.stamp.nanosec / 1e9 for one in kept])
-    np.testing.assert_allclose(np.diff(stamps_s), np.diff(trajectory().stamps_s), rtol=0, atol=2e-9)  # s
+    np.testing.assert_allclose(np.diff(stamps_s), 1 / RATE_HZ, rtol=0, atol=2e-9)  # s
 
 
 def test_where_a_robot_waits_its_last_velocity_is_none(tmp_path):
-    kept, _ = kept_by_the_robots_script(by_mcap_ros2(unpacked(tmp_path, members()) / "PSM2"), PSM2[0])
+    kept, _ = kept_by_the_robots_script(by_mcap_ros2(unpacked(tmp_path, members()) / "000-A1" / "PSM2"), PSM2[0])
     speeds = np.array([one.velocity for one in kept])
-    assert np.flatnonzero((speeds == 0).all(axis=1)).tolist() == [0, 80, 81, 161]
+    assert np.flatnonzero((speeds == 0).all(axis=1)).tolist() == [0, 59]
     steps = np.diff(np.array([one.position for one in kept]), axis=0) * RATE_HZ
-    np.testing.assert_allclose(speeds[1:80], (steps[:79] + steps[1:80]) / 2, rtol=0, atol=1e-9)  # rad/s and m/s
+    np.testing.assert_allclose(speeds[1:59], (steps[:58] + steps[1:59]) / 2, rtol=0, atol=1e-9)  # rad/s and m/s
 
 
 @settings(deadline=None)
@@ -101,7 +116,7 @@ def test_velocities_carry_the_joints_from_rest_to_rest(count, seed):
     rng = np.random.default_rng(seed)
     q = np.cumsum(rng.normal(size=(count, 6)), axis=0)
     stamps_ns = replay_bag.EPOCH_NS + np.arange(count) * 5_000_000
-    v = replay_bag.velocities_of(stamps_ns, q, RATE_HZ)
+    v = replay_bag.velocities_of(stamps_ns, q)
     assert (v[[0, -1]] == 0).all()
     if count > 3:
         way = (q[-1] + q[-2] - q[0] - q[1]) / 2
@@ -112,44 +127,49 @@ def test_velocities_carry_the_joints_from_rest_to_rest(count, seed):
 
 
 def test_the_same_trajectory_gives_the_same_bytes():
-    again = [
-        replay_bag.folder_of(one, "1" * 64)
-        for one in replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
-    ]
-    assert replay_bag.seal(papers(trajectory()) | again[0] | again[1]) == replay_bag.seal(members())
+    again = folders(trajectory(), arms(trajectory()))
+    assert replay_bag.seal(papers(trajectory()) | again) == replay_bag.seal(members())
 
 
-def test_the_timetable_has_every_phase_and_hand_over_on_one_clock():
+def test_the_index_of_two_passes_by_hand():
     """Two passes of 81 samples at 200 Hz, 60 of A1 and 21 of A2, a second apart; stamps begin at 1 s."""
-    arms = replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
-    first, second = replay_bag.pass_times(trajectory(), arms)
-    assert first.phases == [
-        replay_bag.PhaseTimes(phase="A1", from_ns=1_000_000_000, to_ns=1_295_000_000),
-        replay_bag.PhaseTimes(phase="A2", from_ns=1_300_000_000, to_ns=1_400_000_000),
+    index = replay_bag.index_of(trajectory(), arms(trajectory()), "1" * 64)
+    assert [(one.name, one.pass_index, one.from_ns, one.to_ns, one.by_hand) for one in index.segments] == [
+        ("000-A1", 0, 1_000_000_000, 1_295_000_000, ["M1", "M2"]),
+        ("001-A2", 0, 1_295_000_000, 1_400_000_000, []),
+        ("002-A1", 1, 2_405_000_000, 2_700_000_000, ["M1", "M2"]),
+        ("003-A2", 1, 2_700_000_000, 2_805_000_000, []),
     ]
-    assert first.hand_over is first.take_back is None  # the jaws of this motion do not move
-    assert second.phases[0].from_ns == 2_405_000_000
-    alone = replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=1)
-    assert replay_bag.pass_times(trajectory(), alone) == [second]
+    assert index.segments[1].teleoperated == [] and index.segments[2].teleoperated == ["PSM2", "PSM1"]
+    psm_a, psm_m = index.segments[1].arms
+    np.testing.assert_allclose(psm_a.position_mm, trajectory().tip_mm[59], atol=1e-9)
+    assert (psm_a.arm, psm_a.role, psm_a.moves, psm_a.frame, psm_a.jaw_rad) == ("PSM2", "PSM_A", True, FRAME, 0.1)
+    assert (psm_m.arm, psm_m.role, psm_m.moves, psm_m.frame) == ("PSM1", "PSM_M", True, "PSM1_base")
+    assert index.position_tolerance_mm == 0.5 == pytest.approx(index.rotation_tolerance_rad * 10.2)
 
 
-def test_the_timetable_states_when_the_needle_changes_hands():
-    """PSM_M's jaw closes before PSM_A's opens, and in a further pass the other way round; both by the setpoints."""
+def test_a_hand_over_is_a_segment_in_which_both_arms_stand():
+    """PSM_M's jaw closes before PSM_A's opens; the surgeon's hand turns that round before a further A1."""
     motion = time_parametrise([hand_off(), hand_off(-8.0)], rate_hz=100.0, psm_m=BESIDE)
-    arms = replay_bag.arms_of(motion, arm="PSM2", frame=FRAME, other="PSM1")
-    first, second = replay_bag.pass_times(motion, arms)
-    assert first.take_back is None
-    for change, order in ((first.hand_over, ("PSM1", "PSM2")), (second.take_back, ("PSM2", "PSM1"))):
-        closes, opens = change.jaws_in_order
-        assert (closes.arm, opens.arm) == order
-        assert (closes.jaw_rad, opens.jaw_rad) == (JAW_CLOSED_RAD, JAW_OPEN_RAD)
-        assert change.at_ns == closes.from_ns < closes.to_ns == opens.from_ns < opens.to_ns
-        assert opens.to_ns - closes.from_ns == pytest.approx(2e9 * JAW_S, abs=2.1e7)
-        for one in change.jaws_in_order:
-            (arm,) = (arm for arm in arms if arm.name == one.arm)
-            assert arm.jaw_rad[arm.stamps_ns == one.to_ns] == one.jaw_rad
-    held = np.minimum(*(arm.jaw_rad for arm in arms))
-    assert (held == JAW_CLOSED_RAD).all()  # at every sample one of both holds the needle
+    psm_a, psm_m = arms(motion)
+    found = segments_of(motion)
+    assert [(one.kind, one.pass_index) for one in found] == [
+        ("A1", 0), ("A2", 0), ("hand-over", 0), ("transfer", 1), ("A1", 1), ("A2", 1), ("hand-over", 1),
+    ]  # fmt: skip
+    assert [one.by_hand for one in found] == [("M1", "M2"), (), (), (), ("M1", "M2"), (), ()]
+    for one in found:
+        a, m = psm_a.part(one.samples, ""), psm_m.part(one.samples, "")
+        changes = (a.jaw_rad[[0, -1]].tolist(), m.jaw_rad[[0, -1]].tolist())
+        if one.kind == "hand-over":
+            assert changes == ([JAW_CLOSED_RAD, JAW_OPEN_RAD], [JAW_OPEN_RAD, JAW_CLOSED_RAD])
+            assert max(np.ptp(a.joints, axis=0).max(), np.ptp(m.joints, axis=0).max()) <= 1e-9
+            assert (np.minimum(a.jaw_rad, m.jaw_rad) == JAW_CLOSED_RAD).all()  # one of both holds the needle
+            assert one.last - one.first == pytest.approx(2e2 * JAW_S, abs=2)
+        else:
+            assert (np.ptp(a.jaw_rad), np.ptp(m.jaw_rad)) == (0, 0)
+    held = [one.needle_held_by for one in replay_bag.index_of(motion, (psm_a, psm_m), "1" * 64).segments]
+    assert held == ["PSM_A", "PSM_A", "PSM_A", "PSM_M", "PSM_A", "PSM_A", "PSM_A"]
+    assert [one.moves for one in replay_bag.parts_of(motion, (psm_a, psm_m))[0][1]] == [True, False]  # only PSM_A in A1
 
 
 def test_sha256sum_itself_reads_the_checksums(tmp_path):
@@ -160,29 +180,22 @@ def test_sha256sum_itself_reads_the_checksums(tmp_path):
     assert done.stdout.count(": OK") == len(members())
 
 
-def test_one_pass_alone_keeps_its_samples_and_their_stamps():
-    whole, alone = arm(), replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, jaw_rad=0.1, pass_index=1)[0]
-    np.testing.assert_array_equal(alone.stamps_ns, whole.stamps_ns[81:])
-    np.testing.assert_array_equal(alone.joints, whole.joints[81:])
-    assert replay_bag.notes_of(alone, "1" * 64)["pass"] == "1"
-    checked(members(0))
-    checked(members(1))
-
-
-@pytest.mark.parametrize("number", [-1, 2])
-def test_a_pass_that_the_plan_does_not_have_is_refused(number):
-    with pytest.raises(BadPlan, match="0 to 1"):
-        replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, pass_index=number)
+@pytest.mark.parametrize("pause_s", [0.0, 0.01])
+def test_a_pause_of_one_tick_is_refused(pause_s):
+    with pytest.raises(BadSpeed, match="shorter than two samples at 100 Hz"):
+        time_parametrise([hand_off(), hand_off(-8.0)], rate_hz=100.0, pause_s=pause_s)
 
 
 def test_without_psm_ms_place_there_is_no_bag_for_it():
-    arms = replay_bag.arms_of(trajectory(other=False), arm="PSM2", frame=FRAME, jaw_rad=0.1)
-    assert [one.name for one in arms] == ["PSM2"]
-    lines = checked(papers(trajectory(other=False)) | replay_bag.folder_of(arms[0], "1" * 64))
-    assert len(lines) == 5 and lines[3] == "It has no hand-off: no PSM_M, no A2."
-    assert lines[4].startswith("UNSIGNED")
+    alone = trajectory(other=False)
+    assert [one.name for one in arms(alone)] == ["PSM2"]
+    lines = checked(papers(alone) | folders(alone, arms(alone)))
+    assert len(lines) == 6 and lines[4] == "It has no hand-off: no PSM_M, no A2."
+    assert lines[5].startswith("UNSIGNED")
     with pytest.raises(BadBag, match="PSM_M is in the bag and not in"):
-        checked(papers(trajectory()) | replay_bag.folder_of(arms[0], "1" * 64))
+        checked(
+            papers(alone, plan={"psm_m": {"base_mm": [0, 0, 0], "instrument": "420006"}}) | folders(alone, arms(alone))
+        )
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Faults of a bag for replay that `skills verify` finds."""
 
 import io
+import json
 import zipfile
 from dataclasses import replace
 from functools import partial
@@ -14,18 +15,21 @@ from mcap.writer import Writer as McapWriter
 from skills.errors import BadBag, SkillsError
 from skills.formats import bag_writer, replay_bag
 from skills.formats.bag_writer import bag_folder
+from skills.formats.columns import in_mm
 from skills.formats.verify import verify_bag
+from skills.kinematics import forward, quaternion_of
 from tests.formats.others import zipped
-from tests.formats.replays import FRAME, PSM2, RATE_HZ, arm, checked, members, papers, trajectory
+from tests.formats.replays import FRAME, PSM2, arm, arms, checked, folders, members, papers, trajectory
 
 
 def test_a_whole_bag_is_found_right_and_told_of():
     lines = verify_bag(io.BytesIO(replay_bag.seal(members())))
-    assert lines[0].startswith("10 files")
-    assert lines[2].startswith("PSM1 (PSM_M, 420006): 162 samples in 1.80 s")
-    assert lines[3].startswith("PSM2 (PSM_A, 400006): 162 samples in 1.80 s")
+    assert lines[0].startswith("22 files")
+    assert lines[2] == "4 segments: 000-A1, 001-A2, 002-A1, 003-A2."
+    assert lines[3].startswith("PSM1 (PSM_M, 420006): 162 samples in 1.80 s")
+    assert lines[4].startswith("PSM2 (PSM_A, 400006): 162 samples in 1.80 s")
     low, high = trajectory().tip_mm.min(axis=0), trajectory().tip_mm.max(axis=0)
-    assert f"X [{low[0]:.2f}, {high[0]:.2f}]" in lines[3]
+    assert f"X [{low[0]:.2f}, {high[0]:.2f}]" in lines[4]
 
 
 @pytest.mark.parametrize("name", sorted({**members(), "SHA256SUMS": b""}))
@@ -62,12 +66,18 @@ def test_a_flipped_byte_of_the_archive_is_found_by_its_own_checksums():
 
 def rewritten(change: Any, name: str = "PSM2") -> dict[str, bytes]:
     """Return the files of a bag in which one arm's messages were changed, with all checksums correct."""
-    said = [one for one in map(change, replay_bag.messages_of(arm(name))) if one is not None]
-    return members() | bag_folder(said, name, replay_bag.notes_of(arm(name), "1" * 64))
+    files = members()
+    for _, (part,) in replay_bag.parts_of(trajectory(), [arm(name)]):
+        said = [one for one in map(change, replay_bag.messages_of(part)) if one is not None]
+        made = bag_folder(said, name, replay_bag.notes_of(part, "1" * 64))
+        files = files | {f"{part.segment}/{file}": data for file, data in made.items()}
+    return files
 
 
 def remade(motion: replay_bag.ArmMotion, plan: str = "1" * 64) -> dict[str, bytes]:
-    return members() | replay_bag.folder_of(motion, plan)
+    moving = [motion if motion.name == one.name else one for one in arms(trajectory())]
+    index = replay_bag.index_of(trajectory(), moving, "1" * 64).model_dump(mode="json")
+    return papers(trajectory(), index=index) | folders(trajectory(), moving, plan)
 
 
 def stamp_of(sample: int) -> int:
@@ -97,12 +107,12 @@ def test_a_stamp_that_a_robot_would_drop_is_found(first):
 
 def test_a_bag_that_was_made_faster_is_found():
     faster = replay_bag.EPOCH_NS + (arm().stamps_ns - replay_bag.EPOCH_NS) * 9 // 10
-    with pytest.raises(BadBag, match="sample 1 is earlier than 200 Hz allows"):
+    with pytest.raises(BadBag, match="sample 1 is earlier or later than 200 Hz has it"):
         checked(remade(replace(arm(), stamps_ns=faster)))
 
 
 def test_a_missing_jaw_sample_is_found():
-    with pytest.raises(BadBag, match="162 setpoints of its joints, 162 of its tip and 161 of its jaw"):
+    with pytest.raises(BadBag, match="60 setpoints of its joints, 60 of its tip and 59 of its jaw"):
         checked(rewritten(lambda one: None if one.topic == PSM2[2] and one.log_ns == stamp_of(9) else one))
 
 
@@ -142,15 +152,14 @@ def test_metres_taken_for_millimetres_are_found():
 def test_a_joint_beyond_its_limit_is_found_by_sample_and_name():
     joints = arm().joints.copy()
     joints[60:, 4] = radians(81)
-    with pytest.raises(BadBag, match="PSM2, sample 60: wrist_pitch is beyond its limit"):
+    with pytest.raises(BadBag, match="001-A2/PSM2, sample 1: wrist_pitch is beyond its limit"):
         checked(remade(replace(arm(), joints=joints)))
 
 
-@pytest.mark.parametrize("sample", [40, 81])
-def test_a_leap_is_found_within_a_pass_and_between_passes(sample):
+def test_a_leap_is_found_within_a_segment():
     joints = arm().joints.copy()
-    joints[sample:, 0] += 0.01  # at 200 Hz 2 rad/s, over the limit of 1.57
-    with pytest.raises(BadBag, match=f"PSM2, sample {sample}: yaw jumps"):
+    joints[40:, 0] += 0.01  # at 200 Hz 2 rad/s, over the limit of 1.57
+    with pytest.raises(BadBag, match="000-A1/PSM2, sample 40: yaw jumps"):
         checked(remade(replace(arm(), joints=joints)))
 
 
@@ -169,8 +178,9 @@ NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 
 @pytest.mark.parametrize(("names", "frame"), [((*NAMES[:4], "wrist_yaw", "wrist_pitch"), ""), (NAMES, "ECM"), ((), "")])
 def test_other_names_of_joints_or_frames_are_found(names, frame):
-    speeds = iter(replay_bag.velocities_of(arm().stamps_ns, arm().joints, RATE_HZ).tolist())
-    joints = iter(arm().joints.tolist())
+    parts = [part for _, (part,) in replay_bag.parts_of(trajectory(), [arm()])]
+    joints = iter(row for part in parts for row in part.joints.tolist())
+    speeds = iter(row for part in parts for row in replay_bag.velocities_of(part.stamps_ns, part.joints).tolist())
 
     def change(one: bag_writer.Message) -> bag_writer.Message:
         if one.topic != PSM2[0]:
@@ -200,12 +210,10 @@ def test_arms_that_changed_places_are_found():
 
     with pytest.raises(BadBag, match=r"PSM1.mcap has the topic '/PSM2/setpoint_js'"):
         checked({moved(name): data for name, data in members().items()})
-    swapped = [
-        replay_bag.folder_of(one, "1" * 64)
-        for one in replay_bag.arms_of(trajectory(), arm="PSM1", frame=FRAME, jaw_rad=0.1)
-    ]
+    other = replay_bag.arms_of(trajectory(), arm="PSM1", frame=FRAME, jaw_rad=0.1)
+    index = replay_bag.index_of(trajectory(), other, "1" * 64).model_dump(mode="json")
     with pytest.raises(BadBag, match="The plan is for PSM2, but the bag has another PSM_A"):
-        checked(members() | swapped[0] | swapped[1])
+        checked(papers(trajectory(), index=index) | folders(trajectory(), other))
 
 
 def test_a_topic_too_many_is_found():
@@ -232,25 +240,60 @@ def test_a_topic_without_a_type_is_found():
     out.add_message(channel, replay_bag.EPOCH_NS, b"", replay_bag.EPOCH_NS)
     out.finish()
     with pytest.raises(BadBag, match="does not have the type sensor_msgs/msg/JointState"):
-        checked(members() | {"PSM2/PSM2.mcap": file.getvalue()})
+        checked(members() | {"000-A1/PSM2/PSM2.mcap": file.getvalue()})
 
 
 def test_the_arms_keep_the_same_time():
     late = replace(arm("PSM1"), stamps_ns=arm("PSM1").stamps_ns + 1)
-    with pytest.raises(BadBag, match="two arms have different stamps"):
+    with pytest.raises(BadBag, match=r"segments.json is not the index of this bag, at '000-A1'"):
         checked(remade(late))
 
 
 def test_half_a_plan_is_found():
-    columns = ("stamps_ns", "joints", "tip_m", "rotation_xyzw", "jaw_rad")
-    half = replace(arm(), **{name: getattr(arm(), name)[81:] for name in columns})
+    files = {name: data for name, data in members().items() if name[:3] not in ("002", "003")}
+    with pytest.raises(BadBag, match="is not the index of this bag, at '002-A1'"):
+        checked(files)
+    index = json.loads(files["segments.json"])
+    half = json.dumps(index | {"segments": index["segments"][:2]}).encode()
     with pytest.raises(BadBag, match="number of samples"):
-        checked(remade(half))
+        checked(files | {"segments.json": half})
+
+
+@pytest.mark.parametrize(
+    ("segment", "changes"),
+    [
+        (1, {"name": "001-A1", "kind": "A1"}),
+        (1, {"kind": "hand-over"}),
+        (1, {"needle_held_by": "PSM_M"}),
+        (1, {"from_ns": 1_290_000_000}),
+        (2, {"to_ns": 2_705_000_000}),
+        (0, {"arms": []}),
+        (3, {"arms": "moved"}),
+    ],
+)
+def test_another_index_than_the_folders_is_found(segment, changes):
+    index = json.loads(members()["segments.json"])
+    if changes.get("arms") == "moved":
+        changes = {"arms": [one | {"position_mm": [0.0, 0.0, -100.0]} for one in index["segments"][segment]["arms"]]}
+    index["segments"][segment] |= changes
+    with pytest.raises(BadBag, match=r"segments.json is not the index of this bag"):
+        checked(members() | {"segments.json": json.dumps(index).encode()})
+
+
+def test_segments_that_begin_elsewhere_than_the_one_before_ended_are_found():
+    """Each folder is right in itself, and the index is of these folders."""
+    jumped = replace(arm(), joints=arm().joints + np.where(np.arange(162) >= 81, 0.01, 0.0)[:, None])
+    tip_mm, rotation = forward(in_mm(jumped.joints), jumped.instrument)
+    jumped = replace(jumped, tip_m=tip_mm / 1000.0, rotation_xyzw=quaternion_of(rotation))
+    moving = (jumped, arm("PSM1"))
+    index = replay_bag.index_of(trajectory(), moving, "1" * 64).model_dump(mode="json")
+    with pytest.raises(BadBag, match=r"not the index of this bag, at '002-A1'"):
+        checked(papers(trajectory(), index=index) | folders(trajectory(), moving))
 
 
 def test_a_file_without_checksums_is_found(monkeypatch):
     monkeypatch.setattr(bag_writer, "Writer", partial(McapWriter, enable_crcs=False))
-    with pytest.raises(BadBag, match=r"Not every message of PSM2.mcap is covered by a checksum"):
+    with pytest.raises(BadBag, match=r"Not every message of PSM1.mcap is covered by a checksum"):
         checked(remade(arm()))
 
 
@@ -283,11 +326,10 @@ def test_a_file_without_checksums_is_found(monkeypatch):
         ({"plan": {"psm_m": {"base_mm": [0, 0, 0], "instrument": "400006"}}}, "with another instrument"),
         ({"plan": {"psm_m": {"base_mm": None}}}, "PSM_M is in the bag and not in"),
         ({"plan": {"psm_m": True}}, "has a missing or invalid field"),
-        ({"executor": {"plan": "5" * 64}}, "executor.json is not the timetable of this bag"),
-        ({"executor": {"passes": []}}, "executor.json is not the timetable of this bag"),
-        ({"executor": {"passes": [{"phases": [{"from_ns": 1}], "hand_over": None}]}}, "has a missing or invalid field"),
-        ({"executor": {"passes": [{"phases": [], "hand_over": {"at_ns": 7}}]}}, "has a missing or invalid field"),
-        ({"executor": {"passes": [{"index": 0, "phases": [], "hand_over": None}]}}, "is not the timetable of this bag"),
+        ({"index": {"plan": "5" * 64}}, "segments.json is not the index of this bag"),
+        ({"index": {"segments": []}}, "segments.json is not the index of this bag"),
+        ({"index": {"segments": [{"name": "000-A1"}]}}, "has a missing or invalid field"),
+        ({"index": {"position_tolerance_mm": None}}, "has a missing or invalid field"),
     ],
 )
 def test_papers_that_do_not_belong_together_are_found(changes, words):
@@ -309,19 +351,16 @@ def test_a_file_too_few_or_too_many_is_found():
     with pytest.raises(BadBag, match="this has 0"):
         checked(papers(trajectory()))
     with pytest.raises(BadBag, match="this has 3"):
-        checked(members() | {"PSM3/PSM3.mcap": b""})
+        checked(members() | {"000-A1/PSM3/PSM3.mcap": b""})
     with pytest.raises(BadBag, match="SHA256SUMS must list"):
         verify_bag(io.BytesIO(zipped(members() | {"SHA256SUMS": b"\n"})))
 
 
 def test_metadata_of_something_else_are_found():
-    other = replay_bag.folder_of(replay_bag.arms_of(trajectory(), arm="PSM2", frame=FRAME, pass_index=0)[0], "1" * 64)[
-        "PSM2/metadata.yaml"
-    ]
-    mine = members()["PSM2/metadata.yaml"]
+    other, mine = (members()[f"{part}/PSM2/metadata.yaml"] for part in ("001-A2", "000-A1"))
     for wrong in (other, mine.replace(b"cdr", b"cbr"), mine + b" ", b"", mine.replace(b"PSM2.mcap", b"PSM1.mcap")):
-        with pytest.raises(BadBag, match=r"PSM2/metadata.yaml does not describe"):
-            checked(members() | {"PSM2/metadata.yaml": wrong})
+        with pytest.raises(BadBag, match=r"000-A1/PSM2/metadata.yaml does not describe"):
+            checked(members() | {"000-A1/PSM2/metadata.yaml": wrong})
 
 
 @pytest.mark.parametrize("data", [b"", b"PK", b"PK\x05\x06" + bytes(18), b"no zip at all" * 9])

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from skills.errors import BadBag, BadSignature, SkillsError
-from skills.formats.replay_bag import arms_of, folder_of, seal
+from skills.formats.replay_bag import arms_of, index_of, seal
 from skills.formats.verify import SIGNATURE, verify_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
@@ -26,7 +26,7 @@ from skills.planning.trajectory import A1, A2, Trajectory
 from skills.transparency.merkle import Checkpoint, Tree
 from skills.transparency.signing_keys import PublicKey, SigningKey
 from skills.transparency.statements import attest, read_envelope
-from tests.formats.replays import FRAME, judged, members, papers, timetable
+from tests.formats.replays import FRAME, folders, judged, members, papers
 from tests.formats.replays import trajectory as short
 from tests.independent_history import check_envelope
 
@@ -68,8 +68,9 @@ BESIDE: Any = short().psm_m
 def bag_of(made: Trajectory, arm: str = "PSM2", **changes: Any) -> Files:
     """Return the files of a bag without signature, in which everything agrees."""
     arms = arms_of(made, arm=arm, frame=FRAME, other="PSM1" if arm == "PSM2" else "PSM2")
-    said = papers(made, **({"report": {"trajectory": MOTION, "arms": judged(made)}} | changes))
-    return said | {name: data for one in arms for name, data in folder_of(one, PLAN).items()}
+    index = index_of(made, arms, PLAN).model_dump(mode="json")
+    said = papers(made, **({"report": {"trajectory": MOTION, "arms": judged(made)}, "index": index} | changes))
+    return said | folders(made, arms)
 
 
 def digests(files: Files) -> dict[str, str]:
@@ -191,7 +192,15 @@ CHANGES: dict[str, Callable[[], Files]] = {
     "another plan with its own verdict": lambda: members() | papers(short()),
 }  # fmt: skip
 REPORT = {"feasible": True, "trajectory": MOTION, "arms": judged(moved(JOINTS))}
-IN_THEMSELVES = {"a step in one tick", "a shake of 0.45 mm", "A2 removed"}  # those beyond the limits of acceleration
+IN_THEMSELVES = {  # found without the signature
+    "A2 removed": "accelerates beyond its limit",
+    "a step in one tick": "accelerates beyond its limit",
+    "a shake of 0.45 mm": "is not the index",  # a pass begins elsewhere than the one before ended
+    "the passes exchanged": "is not the index",
+    "a stall of 0.5 s": "later than 50 Hz has it",
+    "half as fast": "later than 50 Hz has it",
+    "PSM_M still": "PSM_M is in the bag and not in",
+}
 FORGERY = SigningKey(bytes(32))
 
 
@@ -248,7 +257,7 @@ def test_a_consistent_change_with_right_checksums_is_refused(name: str):
     changed = CHANGES[name]()
     assert digests(changed) != digests({one: data for one, data in exported().items() if one != SIGNATURE})
     if name in IN_THEMSELVES:
-        with pytest.raises(BadBag, match=r"accelerates beyond its limit"):
+        with pytest.raises(BadBag, match=IN_THEMSELVES[name]):
             checked(changed, None)
     else:
         assert checked(changed, None)[-1].startswith("UNSIGNED")  # everything agrees
@@ -263,21 +272,9 @@ def test_another_motion_than_the_judged_one_is_found_without_a_key(joint: int):
     bag = bag_of(bent(joint, 0.01), report=REPORT)
     with pytest.raises(BadBag, match=r"PSM2 is not the motion that was judged"):
         checked(bag, None)
-    still = bag_of(with_other(lambda joints: joints * 0 + joints[:1]), report=REPORT)
+    beside = bag_of(with_other(lambda joints: joints * np.where(np.arange(6) == joint, 1.001, 1.0)), report=REPORT)
     with pytest.raises(BadBag, match=r"PSM1 is not the motion that was judged"):
-        checked(still, None)
-
-
-def test_a_pass_alone_stays_within_the_judged_figures():
-    arms = arms_of(moved(JOINTS), arm="PSM2", frame=FRAME, other="PSM1", pass_index=1)
-    timed = {"passes": timetable(moved(JOINTS), arms)}
-    bag = papers(moved(JOINTS), report=REPORT, executor=timed) | {
-        name: data for one in arms for name, data in folder_of(one, PLAN).items()
-    }
-    assert checked(bag, None)
-    narrower = judged(moved(JOINTS * [1, 1, 1.01, 1, 1, 1]))
-    with pytest.raises(BadBag, match=r"is not the motion that was judged: of insertion, lowest"):
-        checked(bag | papers(moved(JOINTS), report=REPORT | {"arms": narrower}, executor=timed), None)
+        checked(beside, None)
 
 
 @pytest.mark.parametrize("arms", [3, [], [{"name": "PSM_A"}], [{"name": "PSM_A", "joints": [{}]}, {"name": "PSM_M"}]])

@@ -44,6 +44,13 @@ def test_a_job_is_performed_and_what_waits_for_workers_is_left(empty_house: Hous
     assert [empty_house.job(row).state for row in left] == ["queued", "queued", "failed"]
 
 
+def test_pictures_that_the_command_asks_for_are_drawn(empty_house: House, alone: InProcess):
+    others, asked = empty_house.ask(PICTURES), empty_house.ask(PICTURES)
+    alone.submit(asked, 1, PICTURES)
+    assert empty_house.ended(asked).state == "succeeded"
+    assert empty_house.job(others).state == "queued"
+
+
 def test_where_a_worker_is_alive_its_jobs_are_left_to_it(empty_house: House, alone: InProcess, done: list[int]):
     alone._settings = alone._settings.model_copy(update={"lease_s": 600.0})
     with empty_house.database.writing() as session:

@@ -11,11 +11,11 @@ from sqlalchemy.orm import Session
 from skills.db.models import Plan, StoredPictures, StoredPlayback
 from skills.db.service_tables import Job
 from skills.db.session import Database
-from skills.errors import NotDrawnYet, SimulationFailed
+from skills.errors import NotDrawnYet, NotInstalled, SimulationFailed
 from skills.library.operation.integrity import planned
 from skills.library.operation.jobs import cancel
 from skills.library.people.erasure import erase_demo, erase_surgeon
-from skills.library.plans import playbacks
+from skills.library.plans import playback_pictures, playbacks
 from skills.library.plans.plans import trajectory_of
 from skills.library.plans.playback_pictures import PicturesRequest, draw_pictures, find_pictures
 from skills.planning.trajectory import time_parametrise
@@ -103,6 +103,12 @@ def test_asking_again_gives_the_same_job_until_it_has_failed(database: Database,
         again, new, _ = playbacks.request_pictures(session, playback, "test")
     assert new and again.row != job.row
     assert again.id in refusal(database, playback)
+
+
+def test_without_the_extra_a_request_says_what_to_install(database: Database, playback, monkeypatch):
+    monkeypatch.setattr(playback_pictures, "find_spec", lambda name: None if name == "matplotlib" else True)
+    with database.writing() as session, pytest.raises(NotInstalled, match=r"suture-skills\[pictures\]"):
+        playbacks.request_pictures(session, playback, "test")
 
 
 def test_nobody_asked_for_pictures_of_older_playbacks(database: Database, playback: StoredPlayback):

@@ -2,8 +2,10 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from importlib.resources import as_file, files
+from importlib.resources import files
 from math import erf, radians, sqrt
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from hypothesis.extra import numpy as some
 from skills import kinematics
 from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_RADIUS_MM, hand_off, realign
 from skills.planning.trajectory import TRANSFER, PassPath, time_parametrise
+from skills.simulation import simulator
 from skills.verification.arm_errors import MEAN_LENGTH
 from skills.verification.clearance import (
     ASIDE_MM,
@@ -105,17 +108,24 @@ def test_the_links_are_where_the_forward_kinematics_has_the_tip(instrument):
 
 
 def test_the_capsules_are_those_of_the_urdf():
+    """Each is a cylinder, and a sphere of the same radius at either end."""
     root = ElementTree.parse(files("skills") / "urdf" / "psm.urdf").getroot()
     found = {
-        link.get("name"): link.find("collision") for link in root.iter("link") if link.find("collision") is not None
+        link.get("name"): link.findall("collision") for link in root.iter("link") if link.find("collision") is not None
     }
     assert tuple(found) == LINKS
-    sizes = {name: one.find("geometry/capsule").attrib for name, one in found.items()}
     lengths = (kinematics.instrument_of("400006").shaft_mm, kinematics.WRIST_MM, FINGER_MM, FINGER_MM)
     for name, radius, length in zip(LINKS, RADII_MM, lengths, strict=True):
-        assert float(sizes[name]["radius"]) * 1e3 == pytest.approx(radius)
-        assert float(sizes[name]["length"]) * 1e3 == pytest.approx(length)
-    finger = [float(x) * 1e3 for x in found["finger_1"].find("origin").get("xyz").split()]
+        cylinder, *ends = found[name]
+        size = cylinder.find("geometry/cylinder").attrib
+        assert float(size["radius"]) * 1e3 == pytest.approx(radius)
+        assert float(size["length"]) * 1e3 == pytest.approx(length)
+        assert [float(one.find("geometry/sphere").get("radius")) * 1e3 for one in ends] == pytest.approx([radius] * 2)
+        first, last = (np.array(one.find("origin").get("xyz").split(), float) * 1e3 for one in ends)
+        centre = np.array(cylinder.find("origin").get("xyz").split(), float) * 1e3
+        np.testing.assert_allclose((first + last) / 2, centre, atol=1e-9)
+        assert np.linalg.norm(last - first) == pytest.approx(length)
+    finger = [float(x) * 1e3 for x in found["finger_1"][0].find("origin").get("xyz").split()]
     np.testing.assert_allclose(finger, [0, ASIDE_MM, FINGER_MM / 2], atol=1e-9)
     assert pytest.approx(kinematics.JAW_TIP_MM) == FINGER_MM + RADII_MM[2]
 
@@ -181,7 +191,9 @@ class Arm:
 
     def __init__(self, bullet, base_mm=(0.0, 0.0, 0.0), base_xyzw=(0.0, 0.0, 0.0, 1.0)):
         self.bullet, self.client = bullet
-        with as_file(files("skills") / "urdf" / "psm.urdf") as path:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "psm.urdf"
+            path.write_text(simulator.arm_in_capsules((files("skills") / "urdf" / "psm.urdf").read_text(), 15.6))
             self.number = self.bullet.loadURDF(
                 str(path),
                 [x / 1e3 for x in base_mm],

@@ -8,8 +8,7 @@ import pytest
 from skills.kinematics import instrument_of, quaternion_of
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, PsmM
 from skills.planning.plan import SuturePoint, stack
-from skills.planning.trajectory import A1, A2, TRANSFER
-from skills.verification.clearance import stands_from
+from skills.planning.trajectory import A1, A2, TRANSFER, stands_from
 from skills.verification.deviations import LIMITS
 from skills.verification.intent import compare
 from skills.verification.requested import RequestedMotion, requested_motion

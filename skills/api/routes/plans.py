@@ -20,19 +20,18 @@ from skills.api.responses import JSON, Giving, negotiate, say, stored
 from skills.api.routes.recordings import RAW_BODY
 from skills.api.uploads import Incoming
 from skills.db.session import Database
-from skills.formats.replay_bag import rows_of_pass
 from skills.library.operation import overview
 from skills.library.plans import plans
 from skills.library.plans.description import describe_stored, summarise
 from skills.library.plans.plans import find_suture_points, motion_of, trajectory_of
 from skills.library.plans.reach import map_style
-from skills.library.plans.replay import replay_bag
+from skills.library.plans.replay import describe_segments, replay_bag
 from skills.library.plans.replay_comparison import compare_with_plan
 from skills.library.plans.replay_gate import ReplayConditions
 from skills.planning.plan import MAX_PASSES
-from skills.planning.trajectory import Trajectory
+from skills.planning.trajectory import Trajectory, rows_of_pass
 from skills.schemas import Page
-from skills.schemas.plans import Plan, PlanIn, PlanSummary
+from skills.schemas.plans import Plan, PlanIn, PlanSummary, SegmentIndex
 from skills.schemas.plans import Trajectory as GivenTrajectory
 from skills.schemas.playbacks import Comparison
 from skills.schemas.reach import Reach, ReachIn
@@ -122,17 +121,24 @@ def get_trajectory(
 ) -> Response:
     """Return the sampled motion of a plan: JSON, `Accept: text/csv` a table, `Accept: application/zip` the replay bag.
 
-    All of them are 409 if the surgeon's consent does not cover training. The bag is 409 until a feasible playback
-    exists for exactly this plan, its policy is the released one, its demonstration is not withdrawn, the consent covers
-    an export, and every pass is certain enough to succeed; for a plan without a hand-off it also needs `handoff=none`.
+    All of them are 409 if the surgeon's consent does not cover training. The bag is by automatic segment, and 409 until
+    a feasible playback exists for exactly this plan, its policy is the released one, its demonstration is not
+    withdrawn, the consent covers an export, and every pass is certain enough to succeed; for a plan without a hand-off
+    it also needs `handoff=none`.
     """
     media_type = negotiate(accept, "A trajectory", JSON, TABLE, BAG)
     content = _contents(db, plan, pass_index, handoff, media_type, settings)
     given = give.bytes(content, media_type)
     if media_type == BAG:
-        which = "" if pass_index is None else f"-pass-{pass_index}"
-        given.headers["Content-Disposition"] = f'attachment; filename="replay-{plan[:12]}{which}.zip"'
+        given.headers["Content-Disposition"] = f'attachment; filename="replay-{plan[:12]}.zip"'
     return given
+
+
+@router.get("/plans/{plan}/segments", **gives("reader", SegmentIndex, 404, 409))
+def get_segments(plan: Digest, db: Db, give: Giving) -> Response:
+    """Return the automatic segments of a plan: what comes when, who moves, and what must be true before each."""
+    with db.reading() as session:
+        return give(describe_segments(session, plan))
 
 
 @router.get("/plans/{plan}/comparison", **gives("reader", Comparison, 404, 409))
@@ -153,7 +159,7 @@ def _contents(
     settings: Settings,
 ) -> bytes:
     if media_type == BAG:
-        return replay_bag(db, plan, ReplayConditions.of(settings, handoff), pass_index)
+        return replay_bag(db, plan, ReplayConditions.of(settings, handoff))
     with db.reading() as session:
         motion = motion_of(session, plan)
     trajectory = trajectory_of(motion)

@@ -7,7 +7,7 @@ from sqlalchemy.orm import Session
 
 from skills.api.dependencies import Accept, Actor, Configured, Db, Digest, Jobs
 from skills.api.openapi import Declared, gives, gives_file, router_of, starts_job
-from skills.api.responses import Giving, accepted, as_asked, start_job
+from skills.api.responses import Giving, as_asked, start_job
 from skills.db.session import Database
 from skills.formats import BYTES
 from skills.library.operation import locks
@@ -80,16 +80,15 @@ def get_clearance_plot(playback: Digest, db: Db, give: Giving, accept: Accept) -
 
 
 @router.post("/playbacks/{playback}/pictures", **starts_job(404, 409))
-def draw_pictures(playback: Digest, db: Db, actor: Actor) -> Response:
-    """Request the film and the plots; every new playback has requested them already, so this returns that job.
-
-    The engine is not notified, because nobody waits for pictures: a worker finds the job in the queue by itself.
-    """
+def draw_pictures(playback: Digest, db: Db, jobs: Jobs, actor: Actor) -> Response:
+    """Request the film and the plots; every new playback has requested them already, so this returns that job."""
     with db.reading() as session:
         surgeon = find_playback(session, playback).plan.policy.surgeon.slug
-    with db.writing([locks.surgeon(surgeon)]) as session:
-        job, _, did = request_pictures(session, shown_playback(session, playback), actor)
-        return accepted(session, job, did)
+
+    def request(session: Session) -> RequestedJob:
+        return request_pictures(session, shown_playback(session, playback), actor)
+
+    return start_job(db, jobs, [locks.surgeon(surgeon)], request)
 
 
 def _drawn(db: Database, playback: str, which: Callable[[Pictures], bytes]) -> bytes:

@@ -17,7 +17,7 @@ from skills.remedies import did_you_mean
 
 if TYPE_CHECKING:
     from skills.schemas.operation import Job
-    from skills.schemas.plans import Plan, PlanSummary, SuturePointIn, Trajectory
+    from skills.schemas.plans import Plan, PlanSummary, SegmentIndex, SuturePointIn, Trajectory
     from skills.schemas.playbacks import ArmErrorsIn, Comparison, Playback
     from skills.schemas.reach import Reach
     from skills.schemas.timelines import MotionTimeline
@@ -88,21 +88,24 @@ class Plans(Connection):
         # `pass` is a keyword of Python, so it cannot be a keyword argument
         return self._get(schemas.plans.Trajectory, TRAJECTORY, plan=plan, **{"pass": pass_index})
 
-    def replay_bag(self, plan: str, pass_index: int | None = None, *, handoff: Literal["none"] | None = None) -> bytes:
-        """Return the bag that a robot replays, a zip, or that of one pass, counted from 0.
+    def segments(self, plan: str) -> SegmentIndex:
+        """Return the automatic segments of a plan, and what must be true before each."""
+        return self._get(schemas.plans.SegmentIndex, "/plans/{plan}/segments", plan=plan)
+
+    def replay_bag(self, plan: str, *, handoff: Literal["none"] | None = None) -> bytes:
+        """Return the bag that a robot replays, a zip with a folder for each automatic segment.
 
         The bag of a plan that hands nothing over needs `handoff="none"`.
 
         Raises:
             Problem: Of status 409 while the plan may not be replayed, with the reason.
         """
-        return self._bytes(TRAJECTORY, BAG, plan=plan, handoff=handoff, **{"pass": pass_index})
+        return self._bytes(TRAJECTORY, BAG, plan=plan, handoff=handoff)
 
     def save_replay_bag(
         self,
         plan: str,
         to: Path,
-        pass_index: int | None = None,
         progress: Progress | None = None,
         *,
         handoff: Literal["none"] | None = None,
@@ -112,8 +115,7 @@ class Plans(Connection):
         Raises:
             Problem: Of status 409 while the plan may not be replayed, with the reason.
         """
-        which: Mapping[str, Any] = {"pass": pass_index}
-        return self._save(TRAJECTORY, to, progress, accept=BAG, plan=plan, handoff=handoff, **which)
+        return self._save(TRAJECTORY, to, progress, accept=BAG, plan=plan, handoff=handoff)
 
     def compare(self, plan: str, demo: str, pass_index: int = 0) -> Comparison:
         """Compare a pass of a plan, counted from 0, with a demonstration cut from the recording of its replay."""

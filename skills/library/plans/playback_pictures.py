@@ -1,5 +1,6 @@
-"""The film and plots of a playback, drawn by a worker after the verdict is stored."""
+"""The film and plots of a playback, drawn by a worker after the verdict is stored; with the extra `pictures` alone."""
 
+from importlib.util import find_spec
 from typing import ClassVar
 
 from sqlalchemy import select
@@ -8,7 +9,7 @@ from sqlalchemy.orm import Session
 from skills.db.models import StoredPictures, StoredPlayback
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
-from skills.errors import NotDrawnYet
+from skills.errors import NotDrawnYet, NotInstalled
 from skills.fields import as_json
 from skills.library.operation import jobs
 from skills.library.operation.jobs import PICTURES, JobRequest, RequestedJob, Store
@@ -16,6 +17,8 @@ from skills.remedies import Action, Remedy
 from skills.schemas.results import PicturesResult
 from skills.settings import Settings
 from skills.verification.playback import Pictures
+
+EXTRA = ("matplotlib", "imageio_ffmpeg")
 
 
 class PicturesRequest(JobRequest):
@@ -28,8 +31,22 @@ class PicturesRequest(JobRequest):
 
 
 def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> RequestedJob:
-    """Queue the pictures of a stored playback."""
+    """Queue the pictures of a stored playback.
+
+    Raises:
+        NotInstalled: Libraries that draw them are missing here.
+    """
+    if not can_draw():
+        raise NotInstalled(
+            "Films and plots need the extra 'pictures', which is not installed here: "
+            "`pip install 'suture-skills[pictures]'` for the service and its workers."
+        )
     return jobs.ask(session, _wanted(playback), playback.plan.policy.surgeon, actor)
+
+
+def can_draw() -> bool:
+    """Return whether what draws pictures is installed here."""
+    return all(find_spec(name) for name in EXTRA)
 
 
 def draw_pictures(database: Database, request: PicturesRequest, settings: Settings) -> Store[PicturesResult]:

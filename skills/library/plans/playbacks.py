@@ -21,7 +21,7 @@ from skills.library.operation.jobs import JobRequest, RequestedJob, Store
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.plans.headline import CHECK_VERSION, headline
 from skills.library.plans.plans import check_frame, find_plan, hand_of, trajectory_of
-from skills.library.plans.playback_pictures import request_pictures
+from skills.library.plans.playback_pictures import can_draw, request_pictures
 from skills.library.policies import releases, versions
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
@@ -118,7 +118,8 @@ def check_playback(database: Database, request: PlaybackRequest, settings: Setti
             session.add(known)
             record_event(session, actor, "play", "playback", report.identity, plan.policy.surgeon)
             session.flush()
-            request_pictures(session, known, actor)
+            if can_draw():
+                request_pictures(session, known, actor)
         return PlaybackResult(playback=known.sha256, feasible=known.feasible)
 
     return store
@@ -149,7 +150,7 @@ def headline_of(playback: StoredPlayback, settings: Settings) -> Headline:
 def describe_playback(session: Session, row: StoredPlayback, settings: Settings) -> Playback:
     """Return a playback with its headline, and whether its style serves the policy that its plan follows.
 
-    All of its pictures but the first are drawn after the verdict.
+    All of its pictures but the first are drawn after the verdict, where the extra `pictures` is installed.
     """
     here, policy = f"/playbacks/{row.sha256}", row.plan.policy
     return Playback.from_attributes_of(

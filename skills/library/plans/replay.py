@@ -9,25 +9,30 @@ first checkpoint of the history that covers its verdict.
 
 import hashlib
 import json
+from importlib.resources import files
 from typing import Any
 
+from jinja2 import Template
 from pydantic import TypeAdapter
+from sqlalchemy.orm import Session
 
 from skills.db.models import Plan, StoredPlayback
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import Corrupt
-from skills.formats.replay_bag import ArmMotion, ExecutorTimetable, arms_of, folder_of, held_jaw_rad, pass_times, seal
-from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VERDICT
+from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, held_jaw_rad, index_of, parts_of, seal
+from skills.formats.verify import PLAN, POLICY, README, SEGMENTS, SIGNATURE, VERDICT
 from skills.library.operation import proofs
 from skills.library.operation.integrity import learnt, learnt_in, planned
 from skills.library.plans.description import describe_motion, describe_plan
 from skills.library.plans.headline import OF_WORLDS, counted_as, describe_errors, not_judged
-from skills.library.plans.plans import find_plan
+from skills.library.plans.plans import find_plan, motion_of, trajectory_of
 from skills.library.plans.replay_gate import ReplayConditions, cleared
 from skills.library.policies.combined import learnt_from
 from skills.planning.handoff import JAW_CLOSED_RAD
-from skills.schemas.plans import PlanDescription
+from skills.planning.plan import SuturePlan
+from skills.planning.trajectory import Trajectory
+from skills.schemas.plans import PlanDescription, SegmentIndex
 from skills.schemas.playbacks import Verdict
 from skills.transparency.notes import Note
 
@@ -35,29 +40,20 @@ LIMITS = (
     "Certified on its grid alone: coverage and grid_certificate list the checks. They do not cover the arm's "
     "accuracy, of tissue, or of another arm, frame or instrument than these."
 )
-BY_HAND = (
-    "A surgeon inserts the needle and takes it again by hand (M1, M2): before the first setpoint of the first pass, "
-    "and in a further pass before the stamp of take_back, where PSM_A stands to take it. Send no later setpoint before "
-    "that is done. Jaws close on the needle and let it go by setpoints: whoever sees that they do not stops them."
-)
 USE = "Research use only; not a medical device. Never replay it on or near a person."
 
 
-def replay_bag(
-    database: Database, plan_sha256: str, conditions: ReplayConditions, pass_index: int | None = None
-) -> bytes:
-    """Return the replay bag of a plan, or of one of its passes, as the bytes of a zip archive.
+def replay_bag(database: Database, plan_sha256: str, conditions: ReplayConditions) -> bytes:
+    """Return the replay bag of a plan, by automatic segment, as the bytes of a zip archive.
 
     Args:
         database: The database with the plan.
         plan_sha256: The plan's digest.
         conditions: The conditions of the export.
-        pass_index: Export this pass alone, counted from 0; None: all of them.
 
     Raises:
         NotFound: There is no such plan.
         Conflict: The plan must not be replayed, see `cleared`; or consent was withdrawn during the export.
-        BadPlan: The plan has no such pass.
         Corrupt: A stored plan, policy, verdict or motion does not match its digest, or is not as the history has it.
         Busy: The history cannot be signed now.
         BadSettings: The signing key cannot be read.
@@ -66,30 +62,21 @@ def replay_bag(
         row = find_plan(session, plan_sha256)
         plan, policy = planned(row), row.policy
         verdict = cleared(session, row, plan, conditions)
-        partner, jaw_rad = (demo := learnt_from(policy).demo).partner, demo.jaw_rad
         trajectory, report = verdict.measured.trajectory, verdict.report
         # From its verified value, and not the description stored with it.
         about = describe_plan(plan, trajectory, learnt_in(policy))
+        arms = _arms(row, plan, trajectory)
         papers = _papers(row, about, verdict)
         rows = (("plans", row.row), ("playbacks", verdict.row), ("policy_versions", policy.row))
     if digest(trajectory) != report.trajectory:
         raise Corrupt("A stored motion is not the one that its verdict judged; restore it from a backup.")
-    arms = arms_of(
-        trajectory,
-        arm=plan.arm,
-        frame=plan.frame,
-        other=None if partner is None else partner.arm,
-        jaw_rad=held_jaw_rad(jaw_rad, plan.instrument),
-        pass_index=pass_index,
-    )
-    times = pass_times(trajectory, arms)
-    timetable = ExecutorTimetable(plan=row.sha256, use=USE, before_each_pass=BY_HAND, passes=times)
-    papers[EXECUTOR] = timetable.model_dump()
+    index = index_of(trajectory, arms, row.sha256)
+    papers[SEGMENTS] = {"use": USE, **index.model_dump(mode="json")}
     members = {name: _written(paper) for name, paper in papers.items()}
     head = proofs.head_over(database, rows)
-    members[README] = _readme(row, about, report, arms, head).encode()
-    for arm in arms:
-        members |= folder_of(arm, row.sha256)
+    members[README] = _readme(row, about, report, arms, index, head).encode()
+    for part in (part for _, parts in parts_of(trajectory, arms) for part in parts if part.moves):
+        members |= folder_of(part, row.sha256)
     members[SIGNATURE] = proofs.sign_files(
         database.history,
         head,
@@ -104,6 +91,29 @@ def replay_bag(
     with database.reading() as session:  # again: consent or release may have changed while the bag was composed
         cleared(session, find_plan(session, row.sha256), plan, conditions)
     return bag
+
+
+def describe_segments(session: Session, plan_sha256: str) -> SegmentIndex:
+    """Return the automatic segments of a plan, and what must be true before each.
+
+    Raises:
+        NotFound: There is no such plan.
+        Conflict: The surgeon's consent does not cover training.
+    """
+    row = find_plan(session, plan_sha256)
+    trajectory = trajectory_of(motion_of(session, plan_sha256))
+    return index_of(trajectory, _arms(row, planned(row), trajectory), row.sha256)
+
+
+def _arms(row: Plan, plan: SuturePlan, trajectory: Trajectory) -> tuple[ArmMotion, ...]:
+    demo = learnt_from(row.policy).demo
+    return arms_of(
+        trajectory,
+        arm=plan.arm,
+        frame=plan.frame,
+        other=None if demo.partner is None else demo.partner.arm,
+        jaw_rad=held_jaw_rad(demo.jaw_rad, plan.instrument),
+    )
 
 
 # ---- the documents in the bag -----------------------------------------------------------------------------------
@@ -129,57 +139,40 @@ def _written(paper: dict[str, Any]) -> bytes:
     return json.dumps(paper, indent=2, sort_keys=True, allow_nan=False).encode() + b"\n"
 
 
-def _readme(row: Plan, about: PlanDescription, report: Verdict, arms: tuple[ArmMotion, ...], head: Note) -> str:
-    """Return the text of the bag's README: its contents, and the figures of each arm to check before it moves."""
-    under, policy = report.estimate.under[0], row.policy
-    errors = under.errors
-    lines = [
-        f"A needle hand-off for replay: plan {row.sha256},",
-        f"surgeon {policy.surgeon.slug}, {policy.suture}, policy version {policy.version}.",
-        describe_motion(about),
-        "",
-        f"Every pass is likely enough to {OF_WORLDS[counted_as(under)]} with {describe_errors(errors.name)}, "
-        f"as the {report.stated_by} stated them:",
-        f"{errors.describe()}.",
-        f"Not judged: {', '.join(not_judged(about, under))}.",
-        "With greater errors it was not judged: compare these with your arms.",
-        "",
-        USE,
-        "",
-        f"1. `skills verify FILE.zip --key KEY` first, with the public key of the service that wrote {SIGNATURE}.",
-        "2. Then follow docs/replay.md of suture-skills from its beginning: a simulator before a robot.",
-        "",
-        f"History {head.checkpoint.origin}: {head.checkpoint.size} leaves, root {head.checkpoint.root.hex()}",
-    ]
-    if about.orientation == "assumed tool-down":
-        lines += [
-            "",
-            "The demonstration had no orientation. The tool is ASSUMED to point straight down: check its orientation.",
-        ]
-    for arm in arms:
-        lines += ["", *_arm_lines(arm, about.arm, hands=len(arms) > 1)]
-    return "\n".join([*lines, ""])
+def _readme(
+    row: Plan, about: PlanDescription, report: Verdict, arms: tuple[ArmMotion, ...], index: SegmentIndex, head: Note
+) -> str:
+    """Return the text of the bag's README: its contents, the figures of each arm to check, and the commands."""
+    under = report.estimate.under[0]
+    text = (files("skills.library.plans") / "replay_readme.jinja").read_text()
+    template = Template(text, autoescape=False, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    readme: str = template.render(
+        plan=row.sha256,
+        policy=row.policy,
+        motion=describe_motion(about),
+        counted=OF_WORLDS[counted_as(under)],
+        named=describe_errors(under.errors.name),
+        stated_by=report.stated_by,
+        errors=under.errors.describe(),
+        not_judged=", ".join(not_judged(about, under)),
+        use=USE,
+        signature=SIGNATURE,
+        checkpoint=head.checkpoint,
+        assumed=about.orientation == "assumed tool-down",
+        arms=[(arm, _jaw(arm, hands=len(arms) > 1)) for arm in arms],
+        planned_arm=about.arm,
+        index=index,
+    )
+    return readme
 
 
-def _arm_lines(arm: ArmMotion, planned_arm: str, *, hands: bool) -> list[str]:
-    low, high = arm.extent_mm.tolist()
-    box = [f"   {axis}:[{a:f}, {b:f}]" for axis, a, b in zip("XYZ", low, high, strict=True)]
+def _jaw(arm: ArmMotion, *, hands: bool) -> str:
+    """Return the range of an arm's jaw, and what it does."""
     least, most = float(arm.jaw_rad.min()), float(arm.jaw_rad.max())
     if arm.role == "PSM_M":
-        jaw = "open as it comes in; closes on the needle at the end of A2"
-        named = f"{arm.name}, PSM_M: it takes the needle."
+        does = "open as it comes in; closes on the needle at the end of A2"
     else:
-        jaw = "closed, with a holding force" if least == JAW_CLOSED_RAD else "as demonstrated"
-        jaw += " (median)" if least == most != JAW_CLOSED_RAD else ""
-        jaw += "; opens once PSM_M's is closed" if hands else ""
-        named_so = planned_arm.upper() == arm.name
-        assumed = "" if named_so else f" ASSUMED: the demonstration calls its arm {planned_arm!r}."
-        named = f"{arm.name}, PSM_A: it brings the needle.{assumed}"
-    return [
-        named,
-        f"   instrument {arm.instrument}, base frame {arm.frame}, {len(arm.stamps_ns)} samples at {arm.rate_hz:g} Hz",
-        f"   jaw {f'{least:.4f}' if least == most else f'{least:.4f} to {most:.4f}'} rad: {jaw}",
-        "   range of the tip in mm, as `dvrk_bag_replay.py` prints it:",
-        *box,
-        f"   ros2 run dvrk_python dvrk_bag_replay.py -a {arm.name} -b {arm.name} -m servo_jp",
-    ]
+        does = "closed, with a holding force" if least == JAW_CLOSED_RAD else "as demonstrated"
+        does += " (median)" if least == most != JAW_CLOSED_RAD else ""
+        does += "; opens once PSM_M's is closed" if hands else ""
+    return f"{least:.4f} rad: {does}" if least == most else f"{least:.4f} to {most:.4f} rad: {does}"

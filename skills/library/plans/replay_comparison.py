@@ -5,11 +5,11 @@ from sqlalchemy.orm import Session
 
 from skills.arrays import Floats, xyz
 from skills.errors import BadPlan
-from skills.formats.replay_bag import rows_of_pass
 from skills.learning.evaluation import TIE_BREAK, dtw
 from skills.library.operation.integrity import planned
 from skills.library.plans.plans import followed_plan, trajectory_of
 from skills.library.recordings.demos import shown_demo
+from skills.planning.trajectory import rows_of_pass
 from skills.schemas.playbacks import Comparison
 
 POINTS = 1000  # ours, for either path: one every 0.25 mm of a long pass, and 24 MB to align the two

@@ -77,7 +77,7 @@ def request_retraining(
         Conflict: There is no demonstration that may be learnt from, the consent of the only surgeon does not cover
             training, or this surgeon was erased meanwhile.
         BadSettings: With the learner's settings going round in circles pays more than arriving.
-        LearnerNotInstalled: The learner needs a library that is not installed.
+        NotInstalled: The learner needs a library that is not installed.
     """
     with database.reading() as session:
         request, styles = choose_styles(session, batch, limits)

@@ -64,7 +64,7 @@ def request_training(
             combined; or costs of a scene are given without it.
         BadSettings: Learning would need too much memory, or going round in circles would pay more than arriving; or the
             scene is in another frame or is touched by the demonstration, or the learner does not learn in a scene.
-        LearnerNotInstalled: The learner needs a library that is not installed.
+        NotInstalled: The learner needs a library that is not installed.
     """
     request, who = training_request(session, training, limits)
     requested = jobs.ask(session, request, who, actor)
@@ -117,7 +117,7 @@ def learner_to_train(chosen: Learner | None) -> Learner:
 
     Raises:
         BadSettings: With its settings going round in circles pays more than arriving.
-        LearnerNotInstalled: It needs a library that is not installed.
+        NotInstalled: It needs a library that is not installed.
     """
     learner = chosen or PhaseQLearning()
     refuse_loops(RewardLevels(), learner)  # those of every demonstration that is added

@@ -1,0 +1,1 @@
+"""A stand-in: poses are not played."""
