@@ -377,8 +377,7 @@ def _left(tip: Floats, rotation: Floats, tool: InstrumentConstants) -> tuple[Flo
     wrists = _wrists(tip, rotation, tool)
     values = np.concatenate((wrists, wrists[:, ROLL, None] + np.array(_TURNS[1:])[:, None]), axis=1)
     lower, upper = (limits[[*range(6), ROLL, ROLL], None] for limits in (tool.lower, tool.upper))
-    parts = np.minimum(values - lower, upper - values) / (upper - lower)
-    parts = np.where(np.isnan(parts), -np.inf, parts)
+    parts = np.nan_to_num(np.minimum(values - lower, upper - values) / (upper - lower), nan=-np.inf)
     inside = (values >= lower - _ROUND_OFF) & (values <= upper + _ROUND_OFF)
     for of in (parts, inside):
         of[:, ROLL] = of[:, [ROLL, 6, 7]].max(axis=1)
@@ -405,13 +404,9 @@ def _solve(poses: Floats, z5_sign: float, joints: Floats) -> None:
         normal = _across(tip, z6)
         length = _length(normal)
         # If the tip lies on z6, every perpendicular is a solution; x6 is one of them.
-        off = length > 1e-9
-        over = length if off else 1.0
-        z5 = (
-            z5_sign * (normal[0] / over if off else x6[0]),
-            z5_sign * (normal[1] / over if off else x6[1]),
-            z5_sign * (normal[2] / over if off else x6[2]),
-        )
+        over = length if length > 1e-9 else 1.0
+        z5 = (normal[0] / over, normal[1] / over, normal[2] / over) if length > 1e-9 else x6
+        z5 = (z5_sign * z5[0], z5_sign * z5[1], z5_sign * z5[2])
         x5 = _across(z6, z5)
         wrist = (tip[0] - WRIST_MM * x5[0], tip[1] - WRIST_MM * x5[1], tip[2] - WRIST_MM * x5[2])
         depth = _length(wrist)
