@@ -24,6 +24,8 @@ import time
 from asyncio import TimerHandle, Transport
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from email.utils import formatdate
+from functools import lru_cache
 from types import FrameType
 from typing import Any, cast
 
@@ -119,8 +121,9 @@ class PunctualConnection(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def on_message_begin(self) -> None:
-        """Start the timeout of the rest of the head."""
+        """Start the timeout of the rest of the head, and date the response."""
         self._expect()
+        self.server_state.default_headers = _dated(int(time.time()))
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
@@ -176,6 +179,11 @@ class PunctualConnection(HttpToolsProtocol):
             self.transport.abort()
         else:
             self._look = self.loop.call_later(LOOK_S, self._look_on)
+
+
+@lru_cache(maxsize=1)
+def _dated(moment_s: int) -> list[tuple[bytes, bytes]]:
+    return [(b"date", formatdate(moment_s, usegmt=True).encode())]
 
 
 def connections(settings: Settings) -> type[PunctualConnection]:
@@ -382,12 +390,28 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
 
 
 class Server(uvicorn.Server):
-    """A server that runs a function in a thread once it answers, and stops if that function fails."""
+    """A server that runs a function in a thread once it answers, and stops if that function fails.
+
+    It waits for its end, where uvicorn looks for it and dates the responses ten times a second.
+    """
 
     def __init__(self, config: uvicorn.Config, then: Callable[[], None]) -> None:
         super().__init__(config)
         self.refused: SkillsError | None = None
         self._then = then
+        self._left: Callable[[], object] = lambda: None
+
+    async def main_loop(self) -> None:
+        """Wait for the end."""
+        loop, over = asyncio.get_running_loop(), asyncio.Event()
+        self._left = lambda: loop.call_soon_threadsafe(over.set)
+        if not self.should_exit:
+            await over.wait()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """End because of a signal."""
+        super().handle_exit(sig, frame)
+        self._left()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to listen, then start the thread."""
@@ -400,6 +424,7 @@ class Server(uvicorn.Server):
             self._then()
         except SkillsError as refused:
             self.refused, self.should_exit = refused, True
+            self._left()
 
 
 @contextmanager
