@@ -67,10 +67,10 @@ def starting(table: Table, rounds: int) -> None:
         imports, starts = [], []
         for _ in range(rounds + 1):  # the first one fills the caches
             imports.append(importing())
-            with served(url) as (process, ready_s):
+            with served(url) as (process, port, ready_s):
                 used = usage(process.pid)
                 began_s = time.perf_counter()
-                assert status(int(process.args[-1]), POLICY) == 200
+                assert status(port, POLICY) == 200
                 starts.append((ready_s, used, time.perf_counter() - began_s))
         del imports[0], starts[0]
     for name, ours, its in (
@@ -100,7 +100,7 @@ def resting(table: Table, backend: str, rest_s: float, trainings: int) -> None:
     with tempfile.TemporaryDirectory(prefix="skills-rest-") as folder:
         url = backends.fresh(backend, Path(folder))
         learn_two_versions(url)
-        with served(url) as (process, _):
+        with served(url) as (process, port, _):
             time.sleep(VERIFIED_S)
             before = usage(process.pid)
             time.sleep(rest_s)
@@ -111,7 +111,7 @@ def resting(table: Table, backend: str, rest_s: float, trainings: int) -> None:
                 f"{backend}: at rest", f"{processor_s:.2f} s", f"of processor time a minute, {wakes:.1f} wake-ups/s"
             )
             table.add_row("  memory of all its processes", f"{after.memory_bytes / 1e6:.0f} MB", "")
-            late = sorted(starting_late(f"http://127.0.0.1:{process.args[-1]}", url, trainings))
+            late = sorted(starting_late(f"http://127.0.0.1:{port}", url, trainings))
         p99 = late[round((len(late) - 1) * 0.99)]
         table.add_row(
             "  a training starts after", f"{median(late) * 1e3:.0f} ms", f"p99 {p99 * 1e3:.0f} ms, of {trainings}"
@@ -133,7 +133,7 @@ def starting_late(url: str, database_url: str, trainings: int) -> Iterator[float
 
 
 @contextmanager
-def served(url: str) -> Iterator[tuple[subprocess.Popen[bytes], float]]:
+def served(url: str) -> Iterator[tuple[subprocess.Popen[bytes], int, float]]:
     """Start the service with two workers; yield it once it is ready, and the seconds until then."""
     settings = Settings(database_url=url, port=free_port(), workers=WORKERS)
     command = [sys.executable, "-m", "skills", "serve", "--port", str(settings.port)]
@@ -141,7 +141,7 @@ def served(url: str) -> Iterator[tuple[subprocess.Popen[bytes], float]]:
     process = subprocess.Popen(command, cwd=ROOT, env=compiled() | environment(settings), stdout=subprocess.DEVNULL)
     try:
         until(lambda: status(settings.port, "/readyz") == 200, by=[process])
-        yield process, time.perf_counter() - began_s
+        yield process, settings.port, time.perf_counter() - began_s
     finally:
         process.terminate()
         process.wait()
