@@ -5,8 +5,8 @@ and so must the rest of a body when its response is out; and a client must read 
 connection still waits for its unsent bytes, so the rate is measured until the last byte is sent.
 
 The application runs in this process; its workers are child processes at lower priority, so that Python computation
-never delays a response. The service answers first; work that only some requests need, such as loading compiled loops,
-is done afterwards in a thread.
+never delays a response. They are forks of this process, made after the imports and the loading of compiled loops, and
+before it has a thread; so they start at once and share its memory.
 """
 
 import asyncio
@@ -41,7 +41,8 @@ from skills.client import Client
 from skills.compiled import check_cache_setting
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
-from skills.jobs.warm_up import align_once, warm_up
+from skills.jobs.warm_up import learn_once, warm_up
+from skills.jobs.worker import run_child
 from skills.library.operation.erasure_list import keep_erasures, keep_up_erasures
 from skills.library.people.keys import refuse_without_keys
 from skills.remedies import Action, Remedy
@@ -65,7 +66,6 @@ _WORKER = "import gc; gc.disable(); from skills.jobs.worker import main; main()"
 GRACE_S = 12  # a worker finishes its work in progress within ten
 RESTART_S = 1.0
 ERASURES_EVERY_S = 1.0  # ours: an erasure may be missing in the list for this long
-FURTHER_S = 5.0  # between the starts of workers: several that start at once are all ready later than one alone
 
 
 class Counted:
@@ -195,12 +195,20 @@ def connections(settings: Settings) -> type[PunctualConnection]:
     return TimedConnection
 
 
-def start_worker_child(settings: Settings) -> subprocess.Popen[bytes]:
-    """Start a worker in a new interpreter, at lower priority; it ends when this process does.
+def fork_worker(settings: Settings) -> int:
+    """Start a worker in a fork of this process, which must not have started a thread; return its process id.
 
-    End it with `terminate()` and `wait()`: it finishes its work in progress, within ten seconds. It is not restarted
-    automatically.
+    It shares the memory of what this process has imported, and ends when this one does.
     """
+    ours = os.getpid()
+    if (pid := os.fork()) == 0:
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        run_child(settings, ours)
+    return pid
+
+
+def start_worker_child(settings: Settings) -> subprocess.Popen[bytes]:
+    """Start a worker in a new interpreter, in the place of one that has ended; it ends when this process does."""
     return subprocess.Popen(  # noqa: S603 - our own interpreter and module
         [sys.executable, "-c", _WORKER, str(os.getpid())],
         env=environment(settings),
@@ -279,6 +287,13 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     with closing(Database.of(settings)) as database:
         prepare_to_serve(database, settings)
     refuse_keyless(settings)
+    warm_up(learn_once).join()
+    with working(settings):
+        _serve(settings, samples)
+
+
+def _serve(settings: Settings, samples: bool) -> None:
+    """Serve with workers that run already."""
     app = create_app(settings)
 
     def then() -> None:
@@ -290,7 +305,6 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
         if samples:
             threading.Thread(target=_load, args=(settings, app.state.access.own_key), daemon=True).start()
         app.state.reader.server.start()
-        warm_up(align_once)
         layers_held()  # logs a warning if some are missing
 
     server = Server(
@@ -318,7 +332,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     )
     signal.signal(signal.SIGTERM, _leave)  # the server raises a signal again after its shutdown
     signal.signal(signal.SIGINT, _leave)
-    with keeping_erasures(settings), working(settings):
+    with keeping_erasures(settings):
         server.run()
     if server.refused is not None:
         raise server.refused
@@ -475,42 +489,37 @@ def keeping_erasures(settings: Settings) -> Iterator[None]:
 
 @contextmanager
 def working(settings: Settings) -> Iterator[None]:
-    """Run workers during the block; the first starts at once, and one that dies is replaced."""
-    over = threading.Event()
+    """Run workers during the block, and replace those that die; called before this process starts a thread."""
+    crew = [fork_worker(settings) for _ in range(settings.workers)]
+    over, changing = threading.Event(), threading.Lock()
 
-    def watch() -> None:
-        crew: list[subprocess.Popen[bytes]] = []
-        began_s = time.monotonic()
+    def keep(place: int) -> None:
         while True:
-            for place, worker in enumerate(crew):
-                if worker.poll() is not None:
-                    log.warning("A worker ended with %s; another one is started.", worker.returncode)
-                    crew[place] = start_worker_child(settings)
-            if len(crew) < settings.workers and time.monotonic() - began_s >= len(crew) * FURTHER_S:
-                crew.append(start_worker_child(settings))
-            if over.wait(RESTART_S):
-                break
-        _end(crew)
+            status = os.waitpid(crew[place], 0)[1]
+            over.wait(RESTART_S)
+            with changing:
+                if over.is_set():
+                    return
+                log.warning("A worker ended with %s; another one is started.", os.waitstatus_to_exitcode(status))
+                child = start_worker_child(settings)
+                crew[place] = child.pid
 
-    watcher = threading.Thread(target=watch)
-    watcher.start()
+    keepers = [threading.Thread(target=keep, args=(place,), daemon=True) for place in range(len(crew))]
+    for keeper in keepers:
+        keeper.start()
     try:
         yield
     finally:
-        over.set()
-        watcher.join()
-
-
-def _end(crew: list[subprocess.Popen[bytes]]) -> None:
-    """Terminate workers, and kill those that have not finished their work in progress after `GRACE_S`."""
-    for worker in crew:
-        worker.terminate()
-    deadline_s = time.monotonic() + GRACE_S
-    for worker in crew:
-        try:
-            worker.wait(max(0.0, deadline_s - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            worker.kill()
+        with changing:
+            over.set()
+        deadline_s = time.monotonic() + GRACE_S  # a worker finishes its work in progress before
+        for signalled, until_s in ((signal.SIGTERM, deadline_s), (signal.SIGKILL, deadline_s + 1.0)):
+            for pid, keeper in zip(crew, keepers, strict=True):
+                if keeper.is_alive():
+                    with suppress(ProcessLookupError):
+                        os.kill(pid, signalled)
+            for keeper in keepers:
+                keeper.join(max(0.0, until_s - time.monotonic()))
 
 
 def _leave(_signal: int, _frame: FrameType | None) -> None:

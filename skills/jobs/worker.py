@@ -18,6 +18,7 @@ import time
 import uuid
 from collections.abc import Callable
 from threading import Event, Thread
+from typing import NoReturn
 
 from sqlalchemy import select
 
@@ -36,6 +37,7 @@ from skills.logs import job_id, log_fields
 from skills.sandbox.forked import refuse_uncontained
 from skills.settings import Settings
 
+SET_NAME, NAME = 15, b"skills-worker"  # of linux/prctl.h; as top and ps show it
 TRIM, MMAP = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h
 KEPT_BYTES = 64 << 20  # unused memory that the process may hold
 PIECE_BYTES = 32 << 20  # larger blocks are still returned at once; glibc allows no higher threshold
@@ -228,15 +230,24 @@ def _survive(step: Callable[[], object]) -> bool:
         return False
 
 
-def main() -> None:
-    """Run as a child of the process whose id is the first argument, at lower priority than request handling."""
-    settings = Settings()
-    logs.configure(settings.log_level, as_json=settings.log_format == "json")
+def run_child(settings: Settings, parent: int) -> NoReturn:
+    """Run as a child of a process, at lower priority than request handling, and under a name of its own."""
+    ctypes.CDLL(None).prctl(SET_NAME, NAME)
     os.nice(NICENESS)
+    code = 1
     try:
-        run_worker(settings, parent=int(sys.argv[1]))
+        run_worker(settings, parent=parent)
+        code = 0
     except SkillsError as refused:
         log.error("%s", refused)
-        sys.exit(1)
+    except Exception:
+        log.exception("The worker failed.")
     logging.shutdown()
-    os._exit(0)  # does not wait for the warm-up thread, which may still be compiling
+    os._exit(code)  # does not wait for the warm-up thread, which may still be compiling
+
+
+def main() -> None:
+    """Run as a child of the process whose id is the first argument, in an interpreter of its own."""
+    settings = Settings()
+    logs.configure(settings.log_level, as_json=settings.log_format == "json")
+    run_child(settings, int(sys.argv[1]))
