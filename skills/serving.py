@@ -12,6 +12,7 @@ before it has a thread; so they start at once and share its memory.
 import asyncio
 import errno
 import gc
+import json
 import logging
 import os
 import signal
@@ -41,13 +42,14 @@ from skills.client import Client
 from skills.compiled import check_cache_setting
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
+from skills.formats.reader_process import READY, get_ready
 from skills.jobs.warm_up import learn_once, warm_up
 from skills.jobs.worker import run_child
 from skills.library.operation.erasure_list import keep_erasures, keep_up_erasures
 from skills.library.people.keys import refuse_without_keys
 from skills.remedies import Action, Remedy
 from skills.samples import going_on, load_samples
-from skills.sandbox.forked import layers_held, refuse_uncontained
+from skills.sandbox.forked import Fork, fork_ahead, layers_held, refuse_uncontained
 from skills.settings import PREFIX, Settings
 
 log = logging.getLogger("skills.serving")
@@ -195,8 +197,8 @@ def connections(settings: Settings) -> type[PunctualConnection]:
     return TimedConnection
 
 
-def fork_worker(settings: Settings) -> int:
-    """Start a worker in a fork of this process, which must not have started a thread; return its process id.
+def fork_worker(settings: Settings) -> Fork:
+    """Start a worker in a fork of this process, which must not have started a thread.
 
     It shares the memory of what this process has imported, and ends when this one does.
     """
@@ -204,7 +206,7 @@ def fork_worker(settings: Settings) -> int:
     if (pid := os.fork()) == 0:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         run_child(settings, ours)
-    return pid
+    return Fork(pid)
 
 
 def start_worker_child(settings: Settings) -> subprocess.Popen[bytes]:
@@ -269,6 +271,21 @@ def refuse_taken(host: str, port: int) -> None:
         raise
 
 
+def begin(given: int) -> None:
+    """Begin a command in this new image of its process, which has no secret yet: none may reach the reader's process.
+
+    Args:
+        given: A file with the environment and the arguments of the command, as JSON, which is read last.
+    """
+    get_ready()
+    warm_up(learn_once).join()
+    fork_ahead(READY)
+    with os.fdopen(given) as file:
+        environment, sys.argv = json.load(file)
+    os.environ.clear()
+    os.environ.update(environment)
+
+
 def serve(settings: Settings, *, samples: bool = False) -> None:
     """Serve until a signal ends the process; the address must have been checked (`Settings.check_address`).
 
@@ -304,7 +321,7 @@ def _serve(settings: Settings, samples: bool) -> None:
             print(f"The page: {scheme}://{settings.host}:{settings.port}{settings.root_path}/", flush=True)
         if samples:
             threading.Thread(target=_load, args=(settings, app.state.access.own_key), daemon=True).start()
-        app.state.reader.server.start()
+        app.state.reader.server.wait()
         layers_held()  # logs a warning if some are missing
 
     server = Server(
@@ -489,20 +506,20 @@ def keeping_erasures(settings: Settings) -> Iterator[None]:
 
 @contextmanager
 def working(settings: Settings) -> Iterator[None]:
-    """Run workers during the block, and replace those that die; called before this process starts a thread."""
-    crew = [fork_worker(settings) for _ in range(settings.workers)]
+    """Run workers during the block, and replace those that die; forks of this process if it has no other thread yet."""
+    start = fork_worker if threading.active_count() == 1 else start_worker_child
+    crew: list[Fork | subprocess.Popen[bytes]] = [start(settings) for _ in range(settings.workers)]
     over, changing = threading.Event(), threading.Lock()
 
     def keep(place: int) -> None:
         while True:
-            status = os.waitpid(crew[place], 0)[1]
+            code = crew[place].wait()
             over.wait(RESTART_S)
             with changing:
                 if over.is_set():
                     return
-                log.warning("A worker ended with %s; another one is started.", os.waitstatus_to_exitcode(status))
-                child = start_worker_child(settings)
-                crew[place] = child.pid
+                log.warning("A worker ended with %s; another one is started.", code)
+                crew[place] = start_worker_child(settings)
 
     keepers = [threading.Thread(target=keep, args=(place,), daemon=True) for place in range(len(crew))]
     for keeper in keepers:
@@ -514,10 +531,10 @@ def working(settings: Settings) -> Iterator[None]:
             over.set()
         deadline_s = time.monotonic() + GRACE_S  # a worker finishes its work in progress before
         for signalled, until_s in ((signal.SIGTERM, deadline_s), (signal.SIGKILL, deadline_s + 1.0)):
-            for pid, keeper in zip(crew, keepers, strict=True):
+            for worker, keeper in zip(crew, keepers, strict=True):
                 if keeper.is_alive():
                     with suppress(ProcessLookupError):
-                        os.kill(pid, signalled)
+                        os.kill(worker.pid, signalled)
             for keeper in keepers:
                 keeper.join(max(0.0, until_s - time.monotonic()))
 

@@ -23,7 +23,7 @@ from tests.waiting import END_S, children, until
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-WORKER, FORK_SERVER = "skills-worker", "skills.sandbox.fork_server"
+WORKER, FORK_SERVER = "skills-worker", "fork_server"
 REPLACED = 2  # workers that may die while a service starts, as where its database is not yet reachable
 
 
