@@ -17,7 +17,6 @@ from dbos import DBOSClient, WorkflowStatus
 from sqlalchemy import bindparam, delete, exists, func, insert, or_, select, update
 
 from skills.db import now
-from skills.db.engines import open_for_statements
 from skills.db.leaves import CHECKPOINTS, LEAVES
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
@@ -130,7 +129,6 @@ class Watch:
 
     def __post_init__(self) -> None:
         self._unheard = Leases(self.leases.lease_s, self.leases.clock)
-        self._line = open_for_statements(self.database.url)
 
     def beat(self) -> None:
         """Write a heartbeat, and find out whether there may be something `due`, for a round to do.
@@ -139,7 +137,7 @@ class Watch:
         worker at rest does nothing but this, in one statement.
         """
         self.due = True  # also where this fails
-        with self._line.connect() as connection:
+        with self.database.statements.connect() as connection:
             found = connection.execute(BEAT, {"me": self.executor, "at": now()}).first()
             if found is None:  # the first heartbeat, or others have deleted our row
                 connection.execute(insert(Executor).values(id=self.executor))
