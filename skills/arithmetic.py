@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from skills.arrays import Floats
 
 # A quarter turn as a sum; the first two have few bits, so that their product with a million turns is exact.
-_QUARTER = (float.fromhex("0x1.921fb544p+0"), float.fromhex("0x1.0b4611a6p-34"), float.fromhex("0x1.3198a2e037073p-69"))
-_SINE = [(-1) ** k / factorial(2 * k + 1) for k in range(9)]  # of an eighth of a turn the next term is below 1e-19
-_COSINE = [(-1) ** k / factorial(2 * k) for k in range(9)]
-_ARC = [(-1) ** k / (2 * k + 1) for k in range(12)]
+QUARTER = (float.fromhex("0x1.921fb544p+0"), float.fromhex("0x1.0b4611a6p-34"), float.fromhex("0x1.3198a2e037073p-69"))
+SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(9))  # of an eighth of a turn the next term is below 1e-19
+COSINE = tuple((-1) ** k / factorial(2 * k) for k in range(9))
+ARC = tuple((-1) ** k / (2 * k + 1) for k in range(12))
 _LOG_2 = (float.fromhex("0x1.62e42feep-1"), float.fromhex("0x1.a39ef35793c76p-33"))  # a sum: the first has few bits
 _EXPONENTIAL = [1 / factorial(k) for k in range(14)]
 NORMAL_95 = 1.959964  # 95 % of a normal distribution lie within so many standard deviations of its mean
@@ -59,11 +59,11 @@ def _wave(angles_rad: ArrayLike, ahead: int) -> Floats:
     """Return the sines of angles that are some quarter turns ahead of the given ones."""
     angles = np.asarray(angles_rad, np.float64)
     turns = np.rint(angles * (2 / pi))
-    rest = angles - turns * _QUARTER[0] - turns * _QUARTER[1] - turns * _QUARTER[2]
+    rest = angles - turns * QUARTER[0] - turns * QUARTER[1] - turns * QUARTER[2]
     square, quarter = rest * rest, turns + ahead
     quarter = quarter - 4 * np.floor(quarter / 4)  # as floats, because NaN stays NaN
     upright = (quarter == 1) | (quarter == 3)
-    value = np.where(upright, _series(_COSINE, square), rest * _series(_SINE, square))
+    value = np.where(upright, _series(COSINE, square), rest * _series(SINE, square))
     return np.asarray(np.where(quarter >= 2, -value, value))
 
 
@@ -75,7 +75,7 @@ def arctan2(y: ArrayLike, x: ArrayLike) -> Floats:
     tangent = np.minimum(high, wide) / np.where(longer == 0, 1.0, longer)
     for _ in range(2):
         tangent = tangent / (1 + np.sqrt(1 + tangent * tangent))
-    angle = 4 * tangent * _series(_ARC, tangent * tangent)
+    angle = 4 * tangent * _series(ARC, tangent * tangent)
     angle = np.where(high > wide, pi / 2 - angle, angle)
     return np.asarray(np.copysign(np.where(np.signbit(x), pi - angle, angle), y))
 

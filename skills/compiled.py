@@ -4,7 +4,8 @@
     def loop(...)   called as machine code; its attribute `plain` is the Python function
 
 A loop stands beside its caller. It takes arrays and numbers, allocates nothing and raises nothing; the plain function
-and the compiled one agree to the last bit, and a test checks it.
+and the compiled one agree to the last bit, and a test checks it. A division by zero has numpy's result: to look for one
+would keep the compiler from computing several numbers at once.
 
 numba stores machine code in files and loads it without checking who wrote them: in NUMBA_CACHE_DIR if that is set,
 otherwise beside the code, otherwise in the user's cache folder. If none of these is writable, every process compiles
@@ -54,9 +55,9 @@ class Loop:
             while _INNER:
                 register_jitable(_INNER.pop())
         try:
-            return njit(nogil=True, cache=True)(self.plain)
+            return njit(nogil=True, cache=True, error_model="numpy")(self.plain)
         except RuntimeError:  # raised by numba if no cache folder is writable
-            return njit(nogil=True)(self.plain)
+            return njit(nogil=True, error_model="numpy")(self.plain)
 
     @property
     def cache_folder(self) -> Path | None:

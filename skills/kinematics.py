@@ -13,17 +13,18 @@ LARGE_NEEDLE_DRIVER_400006.json and _420006.json, in modified (Craig) Denavit-Ha
 T_i = Rx(alpha) Tx(a) Rz(theta) Tz(d). The inverse is ours.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isnan, nan, pi, radians
+from math import copysign, isnan, nan, pi, radians, sqrt
 from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arithmetic import arcsin, arctan2, cos, product, sin
+from skills.arithmetic import ARC, COSINE, QUARTER, SINE, arctan2, cos, product, sin
 from skills.arrays import Flags, Floats, Ints, frozen
+from skills.compiled import compiled, inner
 from skills.errors import BadInput, ImproperRotation, UnknownInstrument, Unreachable
 from skills.fields import Point, Six, schema
 from skills.remedies import did_you_mean
@@ -38,6 +39,8 @@ WRIST_MM = 9.1  # from the wrist's pitch axis to the hinge of the jaws
 JAW_TIP_MM = 10.2  # from the hinge to the finger tips, along the approach (dvrk_model @70998aa)
 CANNULA_MM = 35.0  # with a smaller insertion the wrist is still inside the cannula (saw engages at 25 mm)
 _USUAL_OFFSET_MM = 15.6  # `wrist_offset_mm` of every tool on an arm of its own generation
+# Only the roll, with limits of 260 degrees either way, has room for a full turn more or less.
+_TURNS = (0.0, 2 * pi, -2 * pi)
 _ROUND_OFF = 1e-9  # rad and mm: a joint exactly at its limit is within it
 
 
@@ -152,8 +155,6 @@ INSTRUMENTS: Mapping[str, InstrumentConstants] = MappingProxyType(
 
 # The paper's orientation at zero joints: the tool points down, its hinge axis along +y.
 POINTING_DOWN: Floats = frozen([[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.float64, (3, 3), "POINTING_DOWN")
-# From the last DH frame to the tip: a rotation only, because the tip is on the hinge.
-_TIP_IN_HINGE: Floats = frozen([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], np.float64, (3, 3), "_TIP_IN_HINGE")
 
 
 def instrument_of(name: str) -> InstrumentConstants:
@@ -274,7 +275,7 @@ def reachable(tip_mm: ArrayLike, rotation: ArrayLike, instrument: str = DEFAULT_
     """
     tool = instrument_of(instrument)
     tip, turned = _poses(tip_mm, rotation)
-    return np.asarray(_within_limits(solutions_of(tip, turned, tool), tool).any(axis=1))
+    return _left(tip, turned, tool)[1]
 
 
 @schema
@@ -319,8 +320,9 @@ def nearest_limit(
     """
     tool = instrument_of(instrument)
     tip, turned = _poses(tip_mm, rotation)
-    solutions = solutions_of(tip, turned, tool)
-    return _nearest_limit(tip, solutions, tool), int(np.count_nonzero(~_within_limits(solutions, tool).any(axis=1)))
+    left, within = _left(tip, turned, tool)
+    one = slice(int(left.argmin()), int(left.argmin()) + 1)
+    return _nearest_limit(tip[one], solutions_of(tip[one], turned[one], tool), tool), int(np.count_nonzero(~within))
 
 
 def joint_margins(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT) -> Floats:
@@ -364,36 +366,125 @@ def solutions_of(tip: Floats, rotation: Floats, tool: InstrumentConstants) -> Fl
     Returns:
         Joints, rad and mm, shape (T, 6, 6): solutions, then joints; NaN where the wrist is in the remote centre.
     """
-    hinge = product(rotation, _TIP_IN_HINGE.T)
-    x6, z6 = hinge[:, :, 0], hinge[:, :, 2]
-    normal = _cross(tip, z6)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    # If the tip lies on z6, every perpendicular is a solution; x6 is one of them.
-    z5 = np.where(length > 1e-9, normal / np.where(length > 1e-9, length, 1.0), x6)
-    wrists = _wrists(tip, x6, z6, np.stack([z5, -z5]), tool)
-    # Only the roll, with limits of 260 degrees either way, has room for a full turn more or less.
-    turns = np.zeros((3, 6))
-    turns[:, ROLL] = 0.0, 2 * pi, -2 * pi
-    return (wrists.swapaxes(0, 1)[:, :, None, :] + turns).reshape(len(tip), 6, 6)
+    turns = np.zeros((len(_TURNS), 6))
+    turns[:, ROLL] = _TURNS
+    wrists = _wrists(tip, rotation, tool).transpose(2, 0, 1)
+    return (wrists[:, :, None] + turns).reshape(len(tip), 6, 6)
 
 
-def _wrists(tip: Floats, x6: Floats, z6: Floats, z5: Floats, tool: InstrumentConstants) -> Floats:
-    """Compute all joints for two choices of the wrist's pitch axis z5, (2, T, 6); NaN if the shaft has no direction."""
-    x5 = _cross(z6, z5)
-    wrist = tip - WRIST_MM * x5
-    depth = np.linalg.norm(wrist, axis=-1)
-    # With the wrist in the remote centre the shaft's direction is undetermined; the wrist is inside the cannula there.
-    shaft = wrist / np.where(depth > 1e-6, depth, np.nan)[..., None]
-    yaw = arctan2(shaft[..., 0], -shaft[..., 2])
-    pitch = -arcsin(np.clip(shaft[..., 1], -1.0, 1.0))
-    s1, c1, s2, c2 = sin(yaw), cos(yaw), sin(pitch), cos(pitch)
-    x3 = np.stack([-s1 * s2, -c2, c1 * s2], axis=-1)
-    y3 = _cross(shaft, x3)
-    roll = arctan2(-_dot(z5, x3), _dot(z5, y3))
-    x4 = cos(roll)[..., None] * x3 + sin(roll)[..., None] * y3
-    wrist_pitch = _wrapped(arctan2(-_dot(x5, shaft), _dot(x5, x4)) + pi / 2)
-    wrist_yaw = _wrapped(arctan2(-_dot(x6, z5), _dot(x6, x5)) + pi / 2)
-    return np.stack([yaw, pitch, depth + tool.wrist_offset_mm, roll, wrist_pitch, wrist_yaw], axis=-1)
+def _left(tip: Floats, rotation: Floats, tool: InstrumentConstants) -> tuple[Floats, Flags]:
+    """Return for each pose the part of its range left to a joint where that is most, and whether it is reached."""
+    wrists = _wrists(tip, rotation, tool)
+    values = np.concatenate((wrists, wrists[:, ROLL, None] + np.array(_TURNS[1:])[:, None]), axis=1)
+    lower, upper = (limits[[*range(6), ROLL, ROLL], None] for limits in (tool.lower, tool.upper))
+    parts = np.nan_to_num(np.minimum(values - lower, upper - values) / (upper - lower), nan=-np.inf)
+    inside = (values >= lower - _ROUND_OFF) & (values <= upper + _ROUND_OFF)
+    for of in (parts, inside):
+        of[:, ROLL] = of[:, [ROLL, 6, 7]].max(axis=1)
+    return parts[:, :6].min(axis=1).max(axis=0), np.asarray(inside[:, :6].all(axis=1).any(axis=0))
+
+
+def _wrists(tip: Floats, rotation: Floats, tool: InstrumentConstants) -> Floats:
+    """Return the joints of all poses, (2, 6, T), for the two signs of the wrist's pitch axis."""
+    wrists, poses = np.empty((2, 6, len(tip))), np.concatenate((tip.T, rotation.reshape(-1, 9).T))
+    for z5_sign, joints in zip((1.0, -1.0), wrists, strict=True):
+        _solve(poses, z5_sign, joints)
+    wrists[:, INSERTION] += tool.wrist_offset_mm
+    return wrists
+
+
+@compiled
+def _solve(poses: Floats, z5_sign: float, joints: Floats) -> None:
+    """Fill in the joints, (6, T), of poses, (12, T): position and rotation; straight on, so that it is vectorised."""
+    for at in range(poses.shape[1]):
+        tip = (poses[0, at], poses[1, at], poses[2, at])
+        # From the last DH frame to the tip is a rotation only, because the tip is on the hinge.
+        x6 = (0.0 - poses[4, at], 0.0 - poses[7, at], 0.0 - poses[10, at])
+        z6 = (0.0 - poses[3, at], 0.0 - poses[6, at], 0.0 - poses[9, at])
+        normal = _across(tip, z6)
+        length = _length(normal)
+        # If the tip lies on z6, every perpendicular is a solution; x6 is one of them.
+        over = length if length > 1e-9 else 1.0
+        z5 = (normal[0] / over, normal[1] / over, normal[2] / over) if length > 1e-9 else x6
+        z5 = (z5_sign * z5[0], z5_sign * z5[1], z5_sign * z5[2])
+        x5 = _across(z6, z5)
+        wrist = (tip[0] - WRIST_MM * x5[0], tip[1] - WRIST_MM * x5[1], tip[2] - WRIST_MM * x5[2])
+        depth = _length(wrist)
+        # With the wrist in the remote centre the shaft's direction is undetermined; the wrist is inside the cannula
+        # there.
+        over = depth if depth > 1e-6 else nan
+        shaft = (wrist[0] / over, wrist[1] / over, wrist[2] / over)
+        sine = min(max(shaft[1], -1.0), 1.0)
+        yaw, pitch = _angle(shaft[0], -shaft[2]), -_angle(sine, sqrt((1 - sine) * (1 + sine)))
+        s1, c1, s2, c2 = _wave(yaw, 0), _wave(yaw, 1), _wave(pitch, 0), _wave(pitch, 1)
+        x3 = (-s1 * s2, -c2, c1 * s2)
+        y3 = _across(shaft, x3)
+        roll = _angle(-_dot(z5, x3), _dot(z5, y3))
+        s4, c4 = _wave(roll, 0), _wave(roll, 1)
+        x4 = (c4 * x3[0] + s4 * y3[0], c4 * x3[1] + s4 * y3[1], c4 * x3[2] + s4 * y3[2])
+        joints[0, at], joints[1, at], joints[2, at], joints[3, at] = yaw, pitch, depth, roll
+        joints[4, at] = _wrapped(_angle(-_dot(x5, shaft), _dot(x5, x4)) + pi / 2)
+        joints[5, at] = _wrapped(_angle(-_in_order(x6, z5), _in_order(x6, x5)) + pi / 2)
+
+
+@inner
+def _angle(y: float, x: float) -> float:
+    """Return `arctan2` of `skills.arithmetic`, with the same bits."""
+    high, wide = abs(y), abs(x)
+    longer = max(high, wide)
+    tangent = min(high, wide) / (1.0 if longer == 0 else longer)
+    for _ in range(2):
+        tangent = tangent / (1 + sqrt(1 + tangent * tangent))
+    angle = 4 * tangent * _series(ARC, tangent * tangent)
+    angle = pi / 2 - angle if high > wide else angle
+    return copysign(pi - angle if copysign(1.0, x) < 0 else angle, y)
+
+
+@inner
+def _wave(angle: float, ahead: int) -> float:
+    """Return `sin`, or a quarter turn ahead `cos`, of `skills.arithmetic`, with the same bits."""
+    turns = float(np.rint(angle * (2 / pi)))
+    rest = angle - turns * QUARTER[0] - turns * QUARTER[1] - turns * QUARTER[2]
+    quarter = (turns + ahead) - 4 * float(np.floor((turns + ahead) / 4))
+    upright = quarter == 1 or quarter == 3
+    value: float = _series(COSINE, rest * rest) if upright else rest * _series(SINE, rest * rest)
+    return -value if quarter >= 2 else value
+
+
+@inner
+def _series(coefficients: Sequence[float], x: float) -> float:
+    total = coefficients[-1]
+    for k in range(len(coefficients) - 2, -1, -1):
+        total = total * x + coefficients[k]
+    return total
+
+
+@inner
+def _across(u: Point, v: Point) -> Point:
+    return (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
+
+
+@inner
+def _length(u: Point) -> float:
+    return sqrt(_in_order(u, u))
+
+
+@inner
+def _dot(u: Point, v: Point) -> float:
+    """Add in the order of SSE2, with which numpy made the digests that are stored."""
+    return (0.0 + u[0] * v[0] + u[2] * v[2]) + u[1] * v[1]
+
+
+@inner
+def _in_order(u: Point, v: Point) -> float:
+    return 0.0 + u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@inner
+def _wrapped(angle: float) -> float:
+    """Wrap an angle, of more than -pi and at most 2 pi, into (-pi, pi]."""
+    below = pi - angle
+    return pi - (below + 2 * pi if below < 0 else below)
 
 
 def _within_limits(solutions: Floats, tool: InstrumentConstants) -> Flags:
@@ -455,20 +546,11 @@ def _out_of_reach(sample: int, tip: Floats, solutions: Floats, tool: InstrumentC
     )
 
 
-def _dot(u: Floats, v: Floats) -> Floats:
-    return np.asarray(np.einsum("...i,...i->...", u, v))
-
-
 def _cross(u: Floats, v: Floats) -> Floats:
     """Return the cross product; numpy's own, for vectors of any length, takes four times as long for a short path."""
     a, b, c = u[..., 0], u[..., 1], u[..., 2]
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
-
-
-def _wrapped(angle: Floats) -> Floats:
-    """Wrap angles into (-pi, pi]."""
-    return np.asarray(pi - (pi - angle) % (2 * pi))
 
 
 # ---- rotations -------------------------------------------------------------------------------------------------

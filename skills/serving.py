@@ -5,13 +5,14 @@ and so must the rest of a body when its response is out; and a client must read 
 connection still waits for its unsent bytes, so the rate is measured until the last byte is sent.
 
 The application runs in this process; its workers are child processes at lower priority, so that Python computation
-never delays a response. The service answers first; work that only some requests need, such as loading compiled loops,
-is done afterwards in a thread.
+never delays a response. They are forks of this process, made after the imports and the loading of compiled loops, and
+before it has a thread; so they start at once and share its memory.
 """
 
 import asyncio
 import errno
 import gc
+import json
 import logging
 import os
 import signal
@@ -24,6 +25,8 @@ import time
 from asyncio import TimerHandle, Transport
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from email.utils import formatdate
+from functools import lru_cache
 from types import FrameType
 from typing import Any, cast
 
@@ -39,12 +42,14 @@ from skills.client import Client
 from skills.compiled import check_cache_setting
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
-from skills.jobs.warm_up import align_once, warm_up
+from skills.formats.reader_process import READY, get_ready
+from skills.jobs.warm_up import learn_once, warm_up
+from skills.jobs.worker import run_child
 from skills.library.operation.erasure_list import keep_erasures, keep_up_erasures
 from skills.library.people.keys import refuse_without_keys
 from skills.remedies import Action, Remedy
 from skills.samples import going_on, load_samples
-from skills.sandbox.forked import layers_held, refuse_uncontained
+from skills.sandbox.forked import Fork, fork_ahead, layers_held, refuse_uncontained
 from skills.settings import PREFIX, Settings
 
 log = logging.getLogger("skills.serving")
@@ -63,7 +68,6 @@ _WORKER = "import gc; gc.disable(); from skills.jobs.worker import main; main()"
 GRACE_S = 12  # a worker finishes its work in progress within ten
 RESTART_S = 1.0
 ERASURES_EVERY_S = 1.0  # ours: an erasure may be missing in the list for this long
-FURTHER_S = 5.0  # between the starts of workers: several that start at once are all ready later than one alone
 
 
 class Counted:
@@ -119,8 +123,9 @@ class PunctualConnection(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def on_message_begin(self) -> None:
-        """Start the timeout of the rest of the head."""
+        """Start the timeout of the rest of the head, and date the response."""
         self._expect()
+        self.server_state.default_headers = _dated(int(time.time()))
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
@@ -178,6 +183,11 @@ class PunctualConnection(HttpToolsProtocol):
             self._look = self.loop.call_later(LOOK_S, self._look_on)
 
 
+@lru_cache(maxsize=1)
+def _dated(moment_s: int) -> list[tuple[bytes, bytes]]:
+    return [(b"date", formatdate(moment_s, usegmt=True).encode())]
+
+
 def connections(settings: Settings) -> type[PunctualConnection]:
     """Return the connection class of a server with these settings."""
 
@@ -187,12 +197,20 @@ def connections(settings: Settings) -> type[PunctualConnection]:
     return TimedConnection
 
 
-def start_worker_child(settings: Settings) -> subprocess.Popen[bytes]:
-    """Start a worker in a new interpreter, at lower priority; it ends when this process does.
+def fork_worker(settings: Settings) -> Fork:
+    """Start a worker in a fork of this process, which must not have started a thread.
 
-    End it with `terminate()` and `wait()`: it finishes its work in progress, within ten seconds. It is not restarted
-    automatically.
+    It shares the memory of what this process has imported, and ends when this one does.
     """
+    ours = os.getpid()
+    if (pid := os.fork()) == 0:
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        run_child(settings, ours)
+    return Fork(pid)
+
+
+def start_worker_child(settings: Settings) -> subprocess.Popen[bytes]:
+    """Start a worker in a new interpreter, in the place of one that has ended; it ends when this process does."""
     return subprocess.Popen(  # noqa: S603 - our own interpreter and module
         [sys.executable, "-c", _WORKER, str(os.getpid())],
         env=environment(settings),
@@ -253,6 +271,21 @@ def refuse_taken(host: str, port: int) -> None:
         raise
 
 
+def begin(given: int) -> None:
+    """Begin a command in this new image of its process, which has no secret yet: none may reach the reader's process.
+
+    Args:
+        given: A file with the environment and the arguments of the command, as JSON, which is read last.
+    """
+    get_ready()
+    warm_up(learn_once).join()
+    fork_ahead(READY)
+    with os.fdopen(given) as file:
+        environment, sys.argv = json.load(file)
+    os.environ.clear()
+    os.environ.update(environment)
+
+
 def serve(settings: Settings, *, samples: bool = False) -> None:
     """Serve until a signal ends the process; the address must have been checked (`Settings.check_address`).
 
@@ -271,6 +304,13 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     with closing(Database.of(settings)) as database:
         prepare_to_serve(database, settings)
     refuse_keyless(settings)
+    warm_up(learn_once).join()
+    with working(settings):
+        _serve(settings, samples)
+
+
+def _serve(settings: Settings, samples: bool) -> None:
+    """Serve with workers that run already."""
     app = create_app(settings)
 
     def then() -> None:
@@ -281,8 +321,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
             print(f"The page: {scheme}://{settings.host}:{settings.port}{settings.root_path}/", flush=True)
         if samples:
             threading.Thread(target=_load, args=(settings, app.state.access.own_key), daemon=True).start()
-        app.state.reader.server.start()
-        warm_up(align_once)
+        app.state.reader.server.wait()
         layers_held()  # logs a warning if some are missing
 
     server = Server(
@@ -310,7 +349,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     )
     signal.signal(signal.SIGTERM, _leave)  # the server raises a signal again after its shutdown
     signal.signal(signal.SIGINT, _leave)
-    with keeping_erasures(settings), working(settings):
+    with keeping_erasures(settings):
         server.run()
     if server.refused is not None:
         raise server.refused
@@ -382,12 +421,28 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
 
 
 class Server(uvicorn.Server):
-    """A server that runs a function in a thread once it answers, and stops if that function fails."""
+    """A server that runs a function in a thread once it answers, and stops if that function fails.
+
+    It waits for its end, where uvicorn looks for it and dates the responses ten times a second.
+    """
 
     def __init__(self, config: uvicorn.Config, then: Callable[[], None]) -> None:
         super().__init__(config)
         self.refused: SkillsError | None = None
         self._then = then
+        self._left: Callable[[], object] = lambda: None
+
+    async def main_loop(self) -> None:
+        """Wait for the end."""
+        loop, over = asyncio.get_running_loop(), asyncio.Event()
+        self._left = lambda: loop.call_soon_threadsafe(over.set)
+        if not self.should_exit:
+            await over.wait()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """End because of a signal."""
+        super().handle_exit(sig, frame)
+        self._left()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to listen, then start the thread."""
@@ -400,6 +455,7 @@ class Server(uvicorn.Server):
             self._then()
         except SkillsError as refused:
             self.refused, self.should_exit = refused, True
+            self._left()
 
 
 @contextmanager
@@ -450,42 +506,37 @@ def keeping_erasures(settings: Settings) -> Iterator[None]:
 
 @contextmanager
 def working(settings: Settings) -> Iterator[None]:
-    """Run workers during the block; the first starts at once, and one that dies is replaced."""
-    over = threading.Event()
+    """Run workers during the block, and replace those that die; forks of this process if it has no other thread yet."""
+    start = fork_worker if threading.active_count() == 1 else start_worker_child
+    crew: list[Fork | subprocess.Popen[bytes]] = [start(settings) for _ in range(settings.workers)]
+    over, changing = threading.Event(), threading.Lock()
 
-    def watch() -> None:
-        crew: list[subprocess.Popen[bytes]] = []
-        began_s = time.monotonic()
+    def keep(place: int) -> None:
         while True:
-            for place, worker in enumerate(crew):
-                if worker.poll() is not None:
-                    log.warning("A worker ended with %s; another one is started.", worker.returncode)
-                    crew[place] = start_worker_child(settings)
-            if len(crew) < settings.workers and time.monotonic() - began_s >= len(crew) * FURTHER_S:
-                crew.append(start_worker_child(settings))
-            if over.wait(RESTART_S):
-                break
-        _end(crew)
+            code = crew[place].wait()
+            over.wait(RESTART_S)
+            with changing:
+                if over.is_set():
+                    return
+                log.warning("A worker ended with %s; another one is started.", code)
+                crew[place] = start_worker_child(settings)
 
-    watcher = threading.Thread(target=watch)
-    watcher.start()
+    keepers = [threading.Thread(target=keep, args=(place,), daemon=True) for place in range(len(crew))]
+    for keeper in keepers:
+        keeper.start()
     try:
         yield
     finally:
-        over.set()
-        watcher.join()
-
-
-def _end(crew: list[subprocess.Popen[bytes]]) -> None:
-    """Terminate workers, and kill those that have not finished their work in progress after `GRACE_S`."""
-    for worker in crew:
-        worker.terminate()
-    deadline_s = time.monotonic() + GRACE_S
-    for worker in crew:
-        try:
-            worker.wait(max(0.0, deadline_s - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            worker.kill()
+        with changing:
+            over.set()
+        deadline_s = time.monotonic() + GRACE_S  # a worker finishes its work in progress before
+        for signalled, until_s in ((signal.SIGTERM, deadline_s), (signal.SIGKILL, deadline_s + 1.0)):
+            for worker, keeper in zip(crew, keepers, strict=True):
+                if keeper.is_alive():
+                    with suppress(ProcessLookupError):
+                        os.kill(worker.pid, signalled)
+            for keeper in keepers:
+                keeper.join(max(0.0, until_s - time.monotonic()))
 
 
 def _leave(_signal: int, _frame: FrameType | None) -> None:

@@ -24,6 +24,7 @@ ON_BOTH = {
     "test_a_deleted_recording_is_gone_at_once_and_swept_later",
     # the life of a job; what follows from it runs on PostgreSQL at night
     "test_one_worker",
+    "test_whoever_listens_hears_each_stroke_of_the_bell",
     "test_what_is_served_stored_and_answered_obeys_the_invariant",
     # consent
     "test_the_question_is_answered_alike_in_python_and_in_sql",

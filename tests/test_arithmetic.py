@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from skills import arithmetic, quaternions
+from skills import arithmetic, kinematics, quaternions
 from skills.arithmetic import wilson
 from skills.quaternions import INVERSE
 
 DRAWN = np.random.default_rng(0)
 ANGLES = np.concatenate([DRAWN.uniform(-20, 20, 20_000), np.arange(-8, 9) * (np.pi / 4), [0.0, 1e5, 1e-300]])
+EDGES = np.array(np.meshgrid(*[[0.0, -0.0, 1.0, -1.0]] * 2)).reshape(2, 16)
 ONE, OTHER = (Rotation.random(500, rng=seed) for seed in (1, 2))
 X, Y = ONE.as_quat(), OTHER.as_quat()
 
@@ -30,6 +31,14 @@ def test_inverse_functions_are_those_of_numpy_within_rounding():
     part = np.concatenate([DRAWN.uniform(-1, 1, 20_000), [-1.0, 0.0, 1.0]])
     assert apart(arithmetic.arcsin(part), np.arcsin(part)) < 1e-15
     assert apart(arithmetic.arccos(part), np.arccos(part)) < 1e-15
+
+
+def test_those_of_single_numbers_in_kinematics_have_the_same_bits():
+    for plain, ahead, array in ((kinematics._wave, 0, arithmetic.sin), (kinematics._wave, 1, arithmetic.cos)):
+        assert np.array([plain(one, ahead) for one in ANGLES.tolist()]).tobytes() == array(ANGLES).tobytes()
+    y, x = (np.concatenate([DRAWN.normal(size=5_000), on]) for on in EDGES)
+    found = [kinematics._angle(*one) for one in zip(y.tolist(), x.tolist(), strict=True)]
+    assert np.array(found).tobytes() == arithmetic.arctan2(y, x).tobytes()
 
 
 @pytest.mark.parametrize("y", [0.0, -0.0, 1.0, -1.0])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from skills import kinematics
 from skills.errors import BadInput, ImproperRotation, UnknownInstrument, Unreachable
 from skills.kinematics import (
     CANNULA_MM,
@@ -18,9 +19,12 @@ from skills.kinematics import (
     inverse,
     joint_margins,
     matrix_of,
+    nearest_limit,
     quaternion_of,
     reachable,
+    solutions_of,
 )
+from tests.learning.loops import run_both
 
 START_MM, GOAL_MM = (-10.0, 55.0, -135.0), (5.0, 55.0, -125.0)
 # yaw, pitch in degrees, insertion in mm, roll, wrist pitch, wrist yaw in degrees
@@ -192,3 +196,25 @@ def test_the_si_has_its_own_efforts():
     """PSM_Si.json has ftmax 17.0845 Nm, 17.0845 Nm and 40.9063 N; LARGE_NEEDLE_DRIVER_420006.json the other three."""
     assert SI.effort == (17.0845, 17.0845, 40.9063, 0.33, 0.25, 0.20)
     assert CLASSIC.effort[:3] == (3.316, 3.316, 9.878)
+
+
+def test_compiled_solutions_agree_with_plain_ones_to_the_last_bit(monkeypatch: pytest.MonkeyPatch):
+    tip, rotation = forward(any_joints(200))
+    tip[0], tip[1] = 0.0, WRIST_MM * rotation[1, :, 0]  # on an axis of the wrist, and out of the cannula
+    agreed = run_both(monkeypatch, kinematics, "_solve")
+    found = solutions_of(tip, rotation, instrument_of("400006"))
+    assert agreed == ["_solve"] * 2
+    assert np.isfinite(found[2:]).all()
+
+
+def test_the_nearest_limit_is_that_of_all_solutions_one_by_one():
+    tip, rotation = forward(any_joints(500, seed=8))
+    tip[::7] *= 1.5
+    tool = instrument_of("400006")
+    margins = joint_margins(solutions_of(tip, rotation, tool).reshape(-1, 6)).reshape(len(tip), 6, 6)
+    left = (margins / (tool.upper - tool.lower)).min(axis=2).max(axis=1)
+    nearest, beyond = nearest_limit(tip, rotation)
+    assert nearest.tip_mm == tuple(tip[left.argmin()].tolist())
+    assert (
+        beyond == np.count_nonzero(~reachable(tip, rotation)) == np.count_nonzero((margins < -1e-9).any(2).all(1)) > 0
+    )

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from datetime import date
+from threading import Event, Thread
 from typing import Any
 
 from fastapi import APIRouter, Response
@@ -72,13 +73,14 @@ class PolicyCache:
     async def watching(self) -> AsyncIterator[None]:
         """Track changes of the database on this event loop; outside this context every request reads the tables."""
         await self.changes.open()
-        sweeping = asyncio.create_task(self._sweep())
+        over = Event()
+        sweeper = Thread(target=self._sweep, args=(over,), name="sweep")
+        sweeper.start()
         try:
             yield
         finally:
-            sweeping.cancel()
-            with suppress(asyncio.CancelledError):
-                await sweeping
+            over.set()
+            await asyncio.to_thread(sweeper.join)
             await self.changes.close()
 
     def cached(self, surgeon: str, suture: str, media_type: str) -> Body | None:
@@ -153,14 +155,13 @@ class PolicyCache:
                 body = self._encoded.policy(served.policy, served, media_type)
             return Known(body, tuple(release), consent.last_day(served.policy.surgeon.consent), None)
 
-    async def _sweep(self) -> None:
+    def _sweep(self, over: Event) -> None:
         """Compare the database with its saved head, and remove erased policies from memory, periodically."""
-        while True:
-            await asyncio.sleep(SWEEP_S)
+        while not over.wait(SWEEP_S):
             with suppress(SkillsError, SQLAlchemyError):  # the database may be readable again at the next sweep
-                await asyncio.to_thread(is_last_signed, self._database)  # sets `History.refused`
-                await asyncio.to_thread(self.forget_erased)
-                await asyncio.to_thread(neighbours.forget_gone, self._database)
+                is_last_signed(self._database)  # sets `History.refused`
+                self.forget_erased()
+                neighbours.forget_gone(self._database)
 
     def forget_erased(self) -> None:
         """Remove from memory every policy that is no longer in the database."""

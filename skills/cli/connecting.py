@@ -46,18 +46,18 @@ def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
     from skills.jobs.in_process import InProcess
 
     alone = workers == 1 <= settings.workers
-    app = create_app(settings, by_path=True, engine=InProcess if alone else Engine)
-    # no check of a key is needed: the caller has access to the database anyway
-    key = {"X-API-Key": app.state.access.own_key}
-    in_process = TestClient(app, base_url="http://localhost", headers=key)
-    with in_process as http, _crew(settings, workers):
-        try:
-            yield Client(http)
-        finally:
-            if settings.erasures_file is not None:
-                from skills.library.operation.erasure_list import keep_up_erasures
+    with _crew(settings, workers):  # first, because workers are forks, and the application has threads
+        app = create_app(settings, by_path=True, engine=InProcess if alone else Engine)
+        # no check of a key is needed: the caller has access to the database anyway
+        key = {"X-API-Key": app.state.access.own_key}
+        with TestClient(app, base_url="http://localhost", headers=key) as http:
+            try:
+                yield Client(http)
+            finally:
+                if settings.erasures_file is not None:
+                    from skills.library.operation.erasure_list import keep_up_erasures
 
-                keep_up_erasures(app.state.database, settings.erasures_file)
+                    keep_up_erasures(app.state.database, settings.erasures_file)
 
 
 def _crew(settings: "Settings", workers: int) -> AbstractContextManager[None]:

@@ -1,9 +1,12 @@
 """Commands on the installation itself: serve, worker, migrate, seed, backup, restore, erasures, verify, doctor."""
 
 import gc
+import json
+import os
+import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -71,9 +74,25 @@ def serve(
     wanted = settings().model_copy(update=given)
     wanted.check_address()  # before anything is imported or changed
     gc.disable()  # imports create no garbage, and looking for it takes a fifth of the start
+    if Path(sys.argv[0]).name in ("skills", "__main__.py") and "skills.serving" not in sys.modules:
+        _begin_again()
     from skills.serving import serve as run
 
     run(wanted, samples=samples)
+
+
+def _begin_again() -> NoReturn:
+    """Replace this process's image by one that has no secret until it has forked the reader's (`skills.serving`)."""
+    from skills.sandbox import environment
+
+    given = os.memfd_create("given", 0)
+    with os.fdopen(given, "w", closefd=False) as file:
+        json.dump([dict(os.environ), sys.argv], file)
+    os.lseek(given, 0, os.SEEK_SET)
+    begin = (
+        f"import gc; gc.disable(); from skills.serving import begin; begin({given}); from skills.cli import app; app()"
+    )
+    os.execve(sys.executable, [sys.executable, "-P", "-c", begin], environment())  # noqa: S606 - our own module
 
 
 @command(commands)

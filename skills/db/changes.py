@@ -10,7 +10,7 @@ it, including a worker's heartbeat, and it includes every commit that finished b
 On PostgreSQL it counts the notifications that have arrived at a listening connection, and the commits of this process.
 A commit of another process is noticed shortly after it, and never later than `BOUND_S`, even if the connection fails:
 the listener sends itself a heartbeat, which returns in order with the notifications; if the last one that returned was
-sent longer ago than that, the version is None.
+sent longer ago than that, the version is None. While nobody asks for the version there are no heartbeats.
 """
 
 import asyncio
@@ -148,6 +148,7 @@ class Notified(Changes):
         self._version = 0
         self._line: PGconn | None = None
         self._beat_s = self._known_s = 0.0  # when the last heartbeat was sent, and the last one that returned
+        self._asked = asyncio.Event()
         self._listening: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
@@ -170,6 +171,7 @@ class Notified(Changes):
 
         It includes all notifications that arrived before the event loop started the request.
         """
+        self._asked.set()
         return None if self._line is None or monotonic() - self._known_s >= BOUND_S else self._version
 
     def _committed(self, session: Session) -> None:
@@ -205,8 +207,10 @@ class Notified(Changes):
         self._line = line
         loop.add_reader(line.socket, self._take_in, line, line.socket)
         try:
-            while self._line is line and monotonic() - self._known_s < GIVEN_UP_S:
+            while self._line is line and (self._known_s == self._beat_s or monotonic() - self._beat_s < GIVEN_UP_S):
                 if self._known_s == self._beat_s and not line.is_busy():
+                    await self._asked.wait()
+                    self._asked.clear()
                     self._beat_s = monotonic()
                     line.send_query(f"NOTIFY {self._own}".encode())
                     line.flush()

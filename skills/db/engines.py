@@ -108,6 +108,22 @@ def open_engine(url: str, patience_ms: int) -> Engine:
     return engine
 
 
+def open_for_statements(url: str) -> Engine:
+    """Open a database for statements without a transaction around them, which must cost little, such as heartbeats.
+
+    On SQLite the last ones may be lost when the machine fails.
+    """
+    engine = create_engine(parse_url(url), isolation_level="AUTOCOMMIT", **_pool(BUSY_TIMEOUT_MS))
+    if engine.dialect.name == "sqlite":
+
+        @event.listens_for(engine, "connect")
+        def _prepare(connection: Any, _record: object) -> None:
+            connection.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
+            connection.execute("PRAGMA synchronous=NORMAL")
+
+    return engine
+
+
 def _forgotten(connection: Connection) -> bool:
     """Delete the notes for the history that others have left; return whether there is a history."""
     try:  # by the driver: SQLAlchemy would end the transaction that has just begun, in which a migration is to be whole

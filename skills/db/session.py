@@ -33,7 +33,7 @@ from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from skills.db.disk import POSTGRESQL_FAILED, Reserve, is_full
-from skills.db.engines import BUSY_TIMEOUT_MS, SPELLING, UNUSABLE, lock_number, open_engine
+from skills.db.engines import BUSY_TIMEOUT_MS, SPELLING, UNUSABLE, lock_number, open_engine, open_for_statements
 from skills.db.history import HISTORY, History
 from skills.db.leaves import CHECKPOINTS
 from skills.db.revisions import refuse_unknown, revision_of, revisions, upgrade
@@ -79,6 +79,7 @@ class Database:
         """
         self.url = url
         self.engine = open_engine(url, patience_ms or BUSY_TIMEOUT_MS)
+        self.statements = open_for_statements(url)
         self.history = History(
             self.engine, signing_key or settings().signing_key, checkpoints or settings().checkpoints
         )
@@ -207,6 +208,7 @@ class Database:
         """Close all connections; one that a thread still uses is closed when the thread returns it."""
         event.listen(self.engine.pool, "checkin", _close_returned)  # to a pool that nobody disposes of any more
         self.engine.dispose()
+        self.statements.dispose()
 
 
 def _close_returned(_connection: DBAPIConnection | None, entry: ConnectionPoolEntry) -> None:

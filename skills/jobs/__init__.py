@@ -6,15 +6,16 @@ only makes sure that a worker processes it.
     attempts    one attempt at a job: try, pause, retry, give up
     in_process  performs jobs in the process of one command, without the engine
     workflows   the workflow of one job, and the engine of a worker, which runs it
+    bell        wakes resting workers when a job is enqueued
     watch       a worker's periodic tasks: leases and heartbeats, enqueueing, taking over from dead workers, outcomes
     readiness   checks of the database, the engine and the workers, for health checks
     warm_up     compiles or loads the compiled loops before they are needed
     worker      the worker process; `skills.serving` starts it as a child of the service
 
 Here is the access to the engine for both sides, and `Engine`, with which the service enqueues jobs. Another engine
-would change this file, `workflows` and `watch`, and nothing else. The engine's inputs are the row and the attempt of a
-job, as plain JSON: its tables hold no personal data, and none of their contents is ever unpickled. Importing DBOS takes
-over a second, so it is imported where it is first needed.
+would change this file, `bell`, `workflows` and `watch`, and nothing else. The engine's inputs are the row and the
+attempt of a job, as plain JSON: its tables hold no personal data, and none of their contents is ever unpickled.
+Importing DBOS takes over a second, so it is imported where it is first needed.
 """
 
 import logging
@@ -36,6 +37,7 @@ from skills.db.disk import make_private
 from skills.db.engines import write_ahead
 from skills.db.session import Database
 from skills.errors import NotReady
+from skills.jobs.bell import ring
 from skills.library.operation.jobs import EXPORT, PART, PICTURES
 from skills.settings import Settings
 
@@ -52,9 +54,6 @@ JOBS, BATCHES, LOW_PRIORITY = "jobs", "batches", "low-priority"
 QUEUES = {JOBS: 2, BATCHES: 2, LOW_PRIORITY: 1}
 WORKFLOW = "perform_job"
 STEPS = "1"  # the engine's "application version": change it if and only if the sequence of steps in `workflows` changes
-# Polling interval of each queue. A poll takes 3 ms of processor time, in idle workers too; a part of a batch occupies a
-# worker for a second.
-POLLING_S = {JOBS: 0.3, BATCHES: 0.3, LOW_PRIORITY: 1.0}
 FAREWELL_S = 2.0  # timeout of `Engine.close`, within which it processes its pending calls
 CLOCK = "skills_clock"  # the name of `Clock` in the engine's URL
 
@@ -74,7 +73,7 @@ def configuration(settings: Settings, executor: str) -> "DBOSConfig":
         "executor_id": executor,
         "application_version": STEPS,
         "log_level": "WARNING",
-        "use_listen_notify": False,  # queues are polled anyway, and we send no messages
+        "use_listen_notify": False,  # of messages, which we do not send; new jobs have the bell
     }
     return found
 
@@ -175,6 +174,7 @@ def submit(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:
         row,
         attempt,
     )
+    ring(client)
 
 
 def cancel(client: "DBOSClient", row: int, attempt: int) -> None:

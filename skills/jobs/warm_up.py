@@ -6,6 +6,7 @@ from threading import Thread
 import numpy as np
 
 from skills.compiled import cache_folders, check_cache_folder, make_ready
+from skills.demonstration.demonstration import Demo
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import certify
@@ -17,9 +18,11 @@ from skills.learning.q_learning import PhaseQLearning
 from skills.learning.tube import certify_tube
 from skills.learning.tube_certificate import TubeLimits
 from skills.packing import palette_of
+from skills.planning.plan import driven_pass
 
 TWO_CELLS = GridPath(GridWorld((0.0, 0.0, 0.0), 1.0, (1, 1, 2)), np.array([0, 1]))
 STILL = np.zeros(2)
+TWO_SAMPLES = Demo("PSM1", "", "PSM1_base", 0.0, 1.0, np.array([0.0, 1.0]), TWO_CELLS.tip_mm)
 TWO_POSES = PosePath(np.eye(2, 3), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.array([0.0, 1.0]), None, STILL, STILL)
 
 
@@ -55,6 +58,7 @@ def learn_once() -> None:
     certify(policy)
     measure(rollout_from(policy, TWO_CELLS.start))
     palette_of(policy.q)
+    driven_pass(policy, TWO_SAMPLES)
     certify_tube(TWO_POSES, TubeLimits())
     align_once()
 

@@ -14,9 +14,10 @@ from math import inf
 from typing import Any
 
 from dbos import DBOSClient, WorkflowStatus
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import bindparam, delete, exists, func, insert, or_, select, update
 
 from skills.db import now
+from skills.db.leaves import CHECKPOINTS, LEAVES
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.jobs import JOBS, QUEUES, STEPS, cancel, submit, workflow_id
@@ -86,6 +87,13 @@ ENDINGS = {
     ),
 }
 
+# The engine runs only the parts of a batch, not the batch itself.
+UNFINISHED = (Job.state.in_(ACTIVE), Job.kind != BATCH)
+_jobs_or_leaves = or_(exists().where(*UNFINISHED), exists().where(LEAVES.c.number.is_(None)))
+_newest = select(func.max(CHECKPOINTS.c.row)).scalar_subquery()
+BEAT = update(Executor).values(beat_at=bindparam("at")).where(Executor.id == bindparam("me"))
+BEAT = BEAT.returning(_jobs_or_leaves.label("due"), _newest.label("checkpoint"))
+
 # `workflows.perform_job` raises nothing itself. If a workflow ends with an error, or without an outcome in our row, the
 # engine's database or ours was unavailable. The job did not fail, so a new attempt is started.
 ENGINE_FAILED = ("ERROR", "SUCCESS")
@@ -105,6 +113,7 @@ class Watch:
             still pending and still assigned to those executors.
         doing: Ids of the workflows that this worker is running; a live view, not a copy.
         sweep: Deletes what nobody needs any more in our database for a moment; returns whether nothing is left.
+        due: Whether at the last heartbeat there may have been something to do.
     """
 
     database: Database
@@ -114,17 +123,26 @@ class Watch:
     recover: Callable[[list[str]], object]
     doing: Collection[str] = frozenset()
     sweep: Callable[[], bool] = lambda: True
+    due: bool = True
     _swept_s: float | None = None
+    _checkpoint: int | None = None  # the newest at the last heartbeat
 
     def __post_init__(self) -> None:
         self._unheard = Leases(self.leases.lease_s, self.leases.clock)
 
     def beat(self) -> None:
-        """Write a heartbeat."""
-        with self.database.writing(()) as session:
-            mine = update(Executor).where(Executor.id == self.executor).values(beat_at=now()).returning(Executor.id)
-            if session.execute(mine).first() is None:  # the first heartbeat, or others have deleted our row
-                session.add(Executor(id=self.executor))
+        """Write a heartbeat, and find out whether there may be something `due`, for a round to do.
+
+        That is so while jobs have not ended or leaves of the history are unsigned, and after each new checkpoint. A
+        worker at rest does nothing but this, in one statement.
+        """
+        self.due = True  # also where this fails
+        with self.database.statements.connect() as connection:
+            found = connection.execute(BEAT, {"me": self.executor, "at": now()}).first()
+            if found is None:  # the first heartbeat, or others have deleted our row
+                connection.execute(insert(Executor).values(id=self.executor))
+            else:
+                self.due, self._checkpoint = found.due or found.checkpoint != self._checkpoint, found.checkpoint
 
     def round(self) -> None:
         """Write a heartbeat, sign the history, take over from dead workers, enqueue new jobs, read back outcomes."""
@@ -153,7 +171,7 @@ class Watch:
     def verify(self) -> None:
         """Verify the history and all logged rows, if this is the first of the workers; log and count the faults."""
         with self.database.reading() as session:
-            first = session.scalar(select(func.min(Executor.id)))
+            first = session.scalar(select(func.min(Executor.id)).where(Executor.id.not_in(self.leases.dead())))
         if first != self.executor or self.database.history.refused is not None:
             return
         with self.database.reading() as session:
@@ -235,12 +253,8 @@ class Watch:
             self.recover(sorted(ours))
 
     def _live(self) -> Sequence[Any]:
-        """Return jobs that have not ended: those never enqueued first, then the oldest.
-
-        Batches themselves are left out, because the engine runs only their parts.
-        """
-        query = select(Job.row, Job.attempt, Job.submitted_at, Job.kind)
-        query = query.where(Job.state.in_(ACTIVE), Job.kind != BATCH)
+        """Return jobs that have not ended: those never enqueued first, then the oldest."""
+        query = select(Job.row, Job.attempt, Job.submitted_at, Job.kind).where(*UNFINISHED)
         with self.database.reading() as session:
             return session.execute(query.order_by(Job.submitted_at.is_not(None), Job.row).limit(AT_ONCE)).all()
 

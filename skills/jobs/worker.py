@@ -17,8 +17,8 @@ import sys
 import time
 import uuid
 from collections.abc import Callable
-from itertools import cycle
 from threading import Event, Thread
+from typing import NoReturn
 
 from sqlalchemy import select
 
@@ -27,8 +27,9 @@ from skills.db.revisions import refuse_other_tables
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import SkillsError
-from skills.jobs import BATCHES, JOBS, connect
+from skills.jobs import BATCHES, JOBS, QUEUES, connect
 from skills.jobs.attempts import Perform, Work
+from skills.jobs.bell import Turn, listen
 from skills.jobs.watch import Leases, Watch
 from skills.jobs.workflows import engine_of, recover_workflows
 from skills.library.operation.sweep import SteadyClock, sweep
@@ -36,6 +37,7 @@ from skills.logs import job_id, log_fields
 from skills.sandbox.forked import refuse_uncontained
 from skills.settings import Settings
 
+SET_NAME, NAME = 15, b"skills-worker"  # of linux/prctl.h; as top and ps show it
 TRIM, MMAP = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h
 KEPT_BYTES = 64 << 20  # unused memory that the process may hold
 PIECE_BYTES = 32 << 20  # larger blocks are still returned at once; glibc allows no higher threshold
@@ -83,9 +85,10 @@ def logged(perform: Perform) -> Perform:
     return run
 
 
-ROUND_S = 0.5
+ROUND_S, REST_S = 0.3, 1.5  # between two heartbeats of a worker with jobs, and of one at rest
+SELDOM = 40  # heartbeats between two rounds at rest, which delete what is out of date
 SWEEPING_S = 0.2  # in a round, which must stay much shorter than a lease
-MISSED_ROUNDS = 20  # in a row; while the database is unavailable the engine's retry pauses grow up to 90 s
+MISSED_ROUNDS = 30  # in a row; while the database is unavailable the engine's retry pauses grow up to 90 s
 DRAIN_S = 8  # jobs that run longer are aborted and run again elsewhere; container runtimes kill after 10 s
 NICENESS = 10
 VERIFY_FIRST_S = 30.0  # after the start of a worker, which has more urgent work then
@@ -120,7 +123,11 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
         refuse_other_tables(session.connection())
     client = connect(settings)
     work = Work(database, settings, perform)
-    leases, clock = Leases(settings.lease_s), SteadyClock()
+    leases, clock, turns = Leases(settings.lease_s), SteadyClock(), [Turn() for _ in QUEUES]
+
+    def poll() -> None:
+        for turn in turns:
+            turn.come()
 
     def sweeping() -> bool:
         return sweep(database, settings, SWEEPING_S, by_age=clock.is_steady())
@@ -135,10 +142,12 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
             executor,
             patience_s=lambda: DRAIN_S if _at_work(watch, JOBS, BATCHES) else 0,
             beat=lambda: _survive(watch.beat),
+            turns=turns,
         ):
+            Thread(target=listen, args=(settings, poll), daemon=True, name="bell").start()
             gc.freeze()  # everything imported so far stays, so later collections skip it
             gc.enable()  # the callers disable it while they import
-            _go_round(watch, lambda: stop.wait(ROUND_S) or parent not in (None, os.getppid()))
+            _go_round(watch, poll, lambda seconds: stop.wait(seconds) or parent not in (None, os.getppid()))
         if _at_work(watch):  # a job's thread cannot be stopped, and a normal exit would wait for it
             log.warning("Stopped during a job; another worker, or this one after its next start, will run it again.")
             logging.shutdown()
@@ -149,16 +158,19 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
         database.close()
 
 
-def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
-    """Run rounds of the watch until `over()` is true.
+def _go_round(watch: Watch, poll: Callable[[], None], over: Callable[[float], bool]) -> None:
+    """Run rounds of the watch, and poll the queues, until `over(seconds)`, which waits between two rounds, is true.
 
     Every second round is only a heartbeat, because comparing the engine's workflows with our rows takes ten times as
-    long. The process exits if the database comes back after `MISSED_ROUNDS` or more failed rounds: the engine's retry
-    pauses have then grown so long that a new process is faster.
+    long. While nothing is due nearly every one is, and the bell alone has the queues polled: the worker rests. The
+    process exits if the database comes back after `MISSED_ROUNDS` or more failed rounds: the engine's retry pauses have
+    then grown so long that a new process is faster.
     """
-    missed = 0
-    for step in cycle((watch.round, watch.beat)):
-        if not _survive(step):
+    missed, beats = 0, SELDOM  # in a row: failed rounds, and heartbeats
+    while True:
+        whole = beats >= (1 if watch.due else SELDOM)
+        beats = 0 if whole else beats + 1
+        if not _survive(watch.round if whole else watch.beat):
             missed += 1
         elif missed < MISSED_ROUNDS:
             missed = 0
@@ -169,7 +181,9 @@ def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
             _survive(watch.hand_back)
             logging.shutdown()
             os._exit(1)
-        if over():
+        if watch.due:
+            poll()
+        if over(ROUND_S if watch.due else min(REST_S, watch.leases.lease_s * 0.75)):
             return
 
 
@@ -203,7 +217,7 @@ def _at_work(watch: Watch, *queues: str) -> bool:
         return True
 
 
-def _survive(step: Callable[[], None]) -> bool:
+def _survive(step: Callable[[], object]) -> bool:
     """Run a step of the watch and return whether it succeeded.
 
     Exceptions are only logged: a database that is locked or unavailable for a while must not end the worker.
@@ -216,15 +230,24 @@ def _survive(step: Callable[[], None]) -> bool:
         return False
 
 
-def main() -> None:
-    """Run as a child of the process whose id is the first argument, at lower priority than request handling."""
-    settings = Settings()
-    logs.configure(settings.log_level, as_json=settings.log_format == "json")
+def run_child(settings: Settings, parent: int) -> NoReturn:
+    """Run as a child of a process, at lower priority than request handling, and under a name of its own."""
+    ctypes.CDLL(None).prctl(SET_NAME, NAME)
     os.nice(NICENESS)
+    code = 1
     try:
-        run_worker(settings, parent=int(sys.argv[1]))
+        run_worker(settings, parent=parent)
+        code = 0
     except SkillsError as refused:
         log.error("%s", refused)
-        sys.exit(1)
+    except Exception:
+        log.exception("The worker failed.")
     logging.shutdown()
-    os._exit(0)  # does not wait for the warm-up thread, which may still be compiling
+    os._exit(code)  # does not wait for the warm-up thread, which may still be compiling
+
+
+def main() -> None:
+    """Run as a child of the process whose id is the first argument, in an interpreter of its own."""
+    settings = Settings()
+    logs.configure(settings.log_level, as_json=settings.log_format == "json")
+    run_child(settings, int(sys.argv[1]))

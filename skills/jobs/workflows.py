@@ -3,14 +3,16 @@
 Each try is a step of the engine, so finished tries are not repeated when another worker takes over.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from threading import Thread
 
 from dbos import DBOS
+from dbos._queue import queue_worker_thread
 
-from skills.jobs import POLLING_S, QUEUES, WORKFLOW, configuration, workflow_id
+from skills.jobs import QUEUES, WORKFLOW, configuration, workflow_id
 from skills.jobs.attempts import Work
+from skills.jobs.bell import Turn
 
 BEAT_S = 0.5  # between two heartbeats while the engine is drained
 
@@ -47,20 +49,33 @@ def recover_workflows(executors: list[str]) -> None:
 
 
 @contextmanager
-def engine_of(work: Work, executor: str, patience_s: Callable[[], int], beat: Callable[[], object]) -> Iterator[None]:
+def engine_of(
+    work: Work, executor: str, patience_s: Callable[[], int], beat: Callable[[], object], turns: Sequence[Turn]
+) -> Iterator[None]:
     """Run the engine for the duration of the block, then drain it: running jobs may finish, new ones are not taken.
+
+    Its threads for what we do not use, such as schedules, delays, messages and queues that are registered later, are
+    stopped at once, because each polls the database every second.
 
     Args:
         work: What performs the jobs.
         executor: The id of this worker in the engine.
         patience_s: Returns the timeout of draining in seconds.
         beat: Writes a heartbeat; without it others would take over the jobs that are being finished.
+        turns: When each queue is polled.
     """
     register(work)
-    DBOS(config=configuration(work.settings, executor))
+    engine = DBOS(config=configuration(work.settings, executor))
     DBOS.launch()
-    for queue, at_once in QUEUES.items():
-        DBOS.register_queue(queue, worker_concurrency=at_once, polling_interval_sec=POLLING_S[queue])
+    for stop in (engine._background_jobs_stop_event, *engine.background_thread_stop_events):
+        stop.set()
+    engine._sys_db._run_background_processes = False
+    for turn, (name, at_once) in zip(turns, QUEUES.items(), strict=True):
+        queue = DBOS.register_queue(name, worker_concurrency=at_once)
+        queue.database_backed_queue = False  # it is not read again at each poll
+        engine.background_thread_stop_events.append(turn)
+        engine._background_threads.append(Thread(target=queue_worker_thread, args=(turn, engine, queue), daemon=True))
+        engine._background_threads[-1].start()
     try:
         yield
     finally:

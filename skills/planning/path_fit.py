@@ -47,13 +47,13 @@ path that they were combined into, at equal shares of the lengths of both paths.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from math import dist
+from math import dist, inf, sqrt
 
 import numpy as np
 
 from skills.arithmetic import product
 from skills.arrays import Flags, Floats, Ints, freeze, interpolated
+from skills.compiled import compiled
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import lengths_along, same_signs, smoothed_tip
 from skills.errors import BadPlan
@@ -276,15 +276,13 @@ def _spread(along: Floats, visits: Ints, cell_mm: float) -> tuple[Floats, Ints]:
     begin, end = begin[kept], end[kept]
     between = (edges[end[:-1]] + edges[begin[1:]]) / 2
     limits = np.concatenate(([0.0], between, along[-1:]))
-    at, of_visit = [np.zeros(1)], [visits[:1]]
-    # Not strict: a path of almost no length has no visit that gets a point.
-    for (low, high), one, other in zip(pairwise(limits), begin, end, strict=False):
-        count = max(1, round((high - low) / (STEP * cell_mm)))
-        places = low + (high - low) * (np.arange(count) + 0.5) / count
-        number = np.searchsorted(edges, places, side="right") - 1
-        at.append(places)
-        of_visit.append(visits[first[number.clip(one, other - 1)]])
-    return np.concatenate([*at, along[-1:]]), np.concatenate([*of_visit, visits[-1:]])
+    # Not of all limits: a path of almost no length has no visit that gets a point.
+    low, wide = limits[: len(begin)], np.diff(limits)[: len(begin)]
+    counts = np.maximum(1, np.rint(wide / (STEP * cell_mm))).astype(np.int64)
+    of = np.repeat(np.arange(len(counts)), counts)
+    places = low[of] + wide[of] * (np.arange(len(of)) - (np.cumsum(counts) - counts)[of] + 0.5) / counts[of]
+    number = (np.searchsorted(edges, places, side="right") - 1).clip(begin[of], end[of] - 1)
+    return np.concatenate(([0.0], places, along[-1:])), np.concatenate((visits[:1], visits[first[number]], visits[-1:]))
 
 
 def _touching(at: Floats, visits: Ints, cells: Ints) -> tuple[Floats, Ints]:
@@ -306,19 +304,27 @@ def _smoothest(wanted: Floats, low: Floats, high: Floats, stiffness: float) -> F
 
     By Nesterov's accelerated projected gradient.
     """
-    rate = 1 / (1 + 16 * stiffness)  # 1 over the largest curvature of the objective; the smallest is 1
-    push = (1 - np.sqrt(rate)) / (1 + np.sqrt(rate))
-    x = ahead = wanted.clip(low, high)
-    for _ in range(_ROUNDS):
-        step = ahead[1:] - ahead[:-1]
-        bend = stiffness * (step[1:] - step[:-1])
-        slope = ahead - wanted
-        slope[:-2] += bend
-        slope[2:] += bend
-        slope[1:-1] -= 2 * bend
-        x, before = np.minimum(np.maximum(ahead - rate * slope, low), high), x
-        ahead = x + push * (x - before)
+    x = wanted.clip(low, high)
+    bend = np.zeros((len(x) + 2, 3))  # of each point, with a point before the first and one after the last
+    _descend(wanted.ravel(), low.ravel(), high.ravel(), stiffness, x.ravel(), x.flatten(), bend.ravel())
     return x
+
+
+@compiled
+def _descend(
+    wanted: Floats, low: Floats, high: Floats, stiffness: float, x: Floats, ahead: Floats, bend: Floats
+) -> None:
+    """Move `x` towards the minimum; all arrays flat, `ahead` equal to `x` and `bend` 0 at first."""
+    rate = 1 / (1 + 16 * stiffness)  # 1 over the largest curvature of the objective; the smallest is 1
+    push = (1 - sqrt(rate)) / (1 + sqrt(rate))
+    for _ in range(_ROUNDS):
+        for i in range(6, len(x)):
+            bend[i] = stiffness * ((ahead[i] - ahead[i - 3]) - (ahead[i - 3] - ahead[i - 6]))
+        for i in range(len(x)):
+            slope = ahead[i] - wanted[i] + bend[i + 6] + bend[i] - 2 * bend[i + 3]
+            after = min(max(ahead[i] - rate * slope, low[i]), high[i])
+            ahead[i] = after + push * (after - x[i])
+            x[i] = after
 
 
 LEAST_MM_S = 1.0  # ours: of an approach, if what is followed after it hardly moves
@@ -460,12 +466,24 @@ def _off_mm(tip_mm: Floats, line: Floats, places: Floats) -> float:
     """Return the greatest distance, mm, of positions, (M, 3), from a line, (K, 3), near given places on it, (M,)."""
     if len(line) == 1:
         return float(np.linalg.norm(tip_mm - line[0], axis=1).max())
-    moves, piece = np.diff(line, axis=0), places.astype(np.int64)
-    near = (piece[:, None] + np.arange(-NEAR, NEAR + 1)).clip(0, len(moves) - 1)
-    off, along = tip_mm[:, None] - line[near], moves[near]
-    part = (off * along).sum(axis=2) / (along**2).sum(axis=2).clip(1e-12)
-    apart = np.linalg.norm(off - part.clip(0.0, 1.0)[..., None] * along, axis=2)
-    return float(apart.min(axis=1).max())
+    return sqrt(_furthest_mm2(np.ascontiguousarray(tip_mm), np.array(line), places))
+
+
+@compiled
+def _furthest_mm2(tip: Floats, line: Floats, places: Floats) -> float:
+    """Return the square of the greatest distance."""
+    furthest = 0.0
+    for at in range(len(tip)):
+        nearest, piece = inf, int(places[at])
+        for first in range(max(piece - NEAR, 0), min(piece + NEAR, len(line) - 2) + 1):
+            u, v, w = tip[at, 0] - line[first, 0], tip[at, 1] - line[first, 1], tip[at, 2] - line[first, 2]
+            a, b = line[first + 1, 0] - line[first, 0], line[first + 1, 1] - line[first, 1]
+            c = line[first + 1, 2] - line[first, 2]
+            part = min(max((u * a + v * b + w * c) / max(a * a + b * b + c * c, 1e-12), 0.0), 1.0)
+            u, v, w = u - part * a, v - part * b, w - part * c
+            nearest = min(nearest, u * u + v * v + w * w)
+        furthest = max(furthest, nearest)
+    return furthest
 
 
 def moved(hand: Hand, rotation: Floats, about_mm: Floats, to_mm: Floats) -> Hand:

@@ -17,11 +17,14 @@ result to another with `packing.write`. That is read as untrusted: only the clas
 their constructors check every number.
 """
 
+import ctypes
 import errno
 import json
 import logging
 import os
+import resource
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -30,6 +33,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
+from select import select
 from threading import Lock
 from typing import IO, Any, BinaryIO, TypeVar
 
@@ -38,7 +42,7 @@ from skills.errors import BadSettings, Busy, Unanswered
 from skills.packing import Known
 from skills.sandbox import ProcessLimits, check_end, environment, overdue
 from skills.sandbox.containment import LAYERS, code_folders
-from skills.sandbox.fork_server import BEGUN
+from skills.sandbox.fork_server import BEGUN, main
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +58,7 @@ WATCHED_S = 1.0  # between two calls of a `Watch`
 WATCHED_BYTES = 1000  # of the end of the output
 _NO_PROCESS = "The machine cannot start another process now; try again in a moment."
 _ENDS = "The fork server of this service ends repeatedly; try again in a moment."
+_PR_SET_NAME = 15  # linux/prctl.h
 _ENTRY = "import sys; from skills.sandbox.fork_server import main; main(*sys.argv[1:])"
 
 
@@ -62,10 +67,31 @@ class _Dead(Exception):
 
 
 @dataclass
+class Fork:
+    """A fork of this process, in place of a `Popen`."""
+
+    pid: int
+
+    def kill(self) -> None:
+        """End it at once."""
+        os.kill(self.pid, signal.SIGKILL)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end, and return its exit code; raises `subprocess.TimeoutExpired`. Call it once."""
+        ended = os.pidfd_open(self.pid)
+        try:
+            if not select([ended], [], [], timeout)[0]:
+                raise subprocess.TimeoutExpired("a fork", timeout or 0.0)
+            return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        finally:
+            os.close(ended)
+
+
+@dataclass
 class _Server:
     """A fork server: its process, and our end of its control socket."""
 
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[bytes] | Fork
     control: socket.socket
     folder: str  # for the temporary files of its forks
     ready: bool = False  # it has imported its modules and is contained
@@ -82,6 +108,7 @@ class _Server:
         shutil.rmtree(self.folder, ignore_errors=True)  # the server does so too, unless it was killed
 
 
+_ahead: dict[tuple[str, ...], _Server] = {}  # forked before they were needed, by their modules
 _layers: tuple[str, ...] | None = None  # those that the first server of this process held
 
 
@@ -231,7 +258,7 @@ class ForkServer:
                 raise Busy("The service is stopping; try again when it runs again.")
             if self._server is None:
                 try:
-                    self._server = _start(self._modules)
+                    self._server = _ahead.pop(self._modules, None) or _start(self._modules)
                 except OSError as error:
                     raise Busy(_NO_PROCESS) from error
             return self._server
@@ -302,6 +329,24 @@ def _failed_reading(error: BaseException | None) -> OSError | None:
             return error
         error = error.__cause__ or error.__context__
     return None
+
+
+def fork_ahead(*modules: str) -> None:
+    """Fork the server of some modules from this process; the first `ForkServer` of these modules takes it.
+
+    Like a server in a new interpreter, this process must have no thread, no secret, and a minimal environment.
+    """
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    folder = tempfile.mkdtemp(prefix="suture-skills-")
+    if (pid := os.fork()) == 0:
+        os.setsid()
+        ctypes.CDLL(None).prctl(_PR_SET_NAME, b"fork_server")
+        os.dup2(theirs.fileno(), 0)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.closerange(3, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+        main(folder, json.dumps(code_folders()), json.dumps(None), *modules)
+    theirs.close()
+    _ahead[modules] = _Server(Fork(pid), ours, folder)
 
 
 def _start(modules: tuple[str, ...]) -> _Server:

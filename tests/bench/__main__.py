@@ -27,12 +27,14 @@ from tests.bench.recognition import recognition
 from tests.bench.scaling import scaling
 from tests.bench.serving import serving
 from tests.bench.session import session
+from tests.bench.start import start
 from tests.bench.ties import ties
 from tests.bench.tissue import tissue
 from tests.bench.upkeep import upkeep
 from tests.bench.writers import writers
 
 PARTS = {
+    "start": start,
     "reading": reading,
     "exporting": exporting,
     "containment": containing,

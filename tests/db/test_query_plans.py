@@ -83,6 +83,7 @@ HOT: dict[str, Callable[[Session], object]] = {
     "where what was learnt stands": lambda s: learning.demo_states(s, [1, 2, 3]),
     "what is known already": lambda s: learning.find_stored(s, ["0" * 64, "1" * 64]),
     "what some styles serve": lambda s: releases.served_versions(s, {(1, "simple-running"), (2, "simple-running")}),
+    "whether new versions pass the gate": lambda s: releases.release_new(s, {1: None, 2: None}, "test", 30.0),
     "jobs": lambda s: jobs.list_jobs(s, 10, 50, None),
     "jobs of a state": lambda s: jobs.list_jobs(s, 10, 50, "failed"),
     "jobs of a kind": lambda s: jobs.list_jobs(s, 10, 50, None, "playback"),

@@ -23,7 +23,7 @@ from tests.waiting import END_S, children, until
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-WORKER, FORK_SERVER = "skills.jobs.worker", "skills.sandbox.fork_server"
+WORKER, FORK_SERVER = "skills-worker", "fork_server"
 REPLACED = 2  # workers that may die while a service starts, as where its database is not yet reachable
 
 
@@ -72,17 +72,18 @@ class Service:
             until(ready, by=[self.process])
 
     def child(self, word: str) -> int:
-        """Return the child process with a word on its command line: its worker, or its fork server."""
+        """Return the child process with a word in its name or on its command line: its worker, or its fork server."""
         (child,) = self.children(word)
         return child
 
     def children(self, word: str) -> list[int]:
-        """Return the child processes with a word on their command lines."""
+        """Return the child processes with a word in their names or on their command lines."""
         assert self.process is not None
         found = []
         for pid in children(self.process.pid):
             with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended
-                found += [pid] if word in Path(f"/proc/{pid}/cmdline").read_text() else []
+                said = Path(f"/proc/{pid}/cmdline").read_text() + Path(f"/proc/{pid}/comm").read_text()
+                found += [pid] if word in said else []
         return found
 
     def kill(self) -> None:

@@ -1,9 +1,11 @@
 """The service as processes: killed and restarted, stopped, refused."""
 
 import os
+import secrets
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -53,7 +55,33 @@ def test_a_recording_is_returned_exactly_and_two_segments_give_two_demos(tmp_pat
         assert all(client.demo_recording(d.id) == sample.data for d in demos)
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.nightly)])  # the second starts 5 s later
+def test_the_process_of_the_readers_has_no_secret_in_its_memory(tmp_path: Path) -> None:
+    secret = secrets.token_hex(16)
+    with running(tmp_path, workers=0, api_key=secret) as service:
+        reader = service.child(FORK_SERVER)
+        assert secret.encode() not in Path(f"/proc/{reader}/environ").read_bytes()
+        try:
+            held = [has_in_memory(pid, secret.encode()) for pid in (service.process.pid, reader)]
+        except PermissionError:
+            pytest.skip("NOT TESTED - only root may read the memory of a process that is not dumpable")
+    assert held == [True, False]
+
+
+def has_in_memory(pid: int, word: bytes) -> bool:
+    """Return whether the writable memory of a process contains a word."""
+    with open(f"/proc/{pid}/mem", "rb", buffering=0) as memory:
+        for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
+            place, rights, *_ = line.split()
+            if rights.startswith("rw"):
+                start, end = (int(part, 16) for part in place.split("-"))
+                memory.seek(start)
+                with suppress(OSError):  # of a device
+                    if word in (memory.read(end - start) or b""):
+                        return True
+    return False
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.nightly)])
 def test_a_stopped_service_exits_with_0_and_takes_its_children_along(tmp_path: Path, workers: int) -> None:
     with running(tmp_path, workers=workers) as service:
         until(lambda: len(service.children(WORKER)) == workers)

@@ -150,4 +150,4 @@ def test_a_batch_cancelled_midway_keeps_its_results_and_adds_none(database: Data
     assert (look(database, job).state, done(database, job)) == ("cancelled", kept)
     with database.reading() as session:
         learners = session.scalars(select(PolicyVersion.manifest)).all()
-    assert sum(one["settings"].get("episodes") == SLOW.episodes for one in learners) == kept
+    assert sum(one.settings.get("episodes") == SLOW.episodes for one in learners) == kept

@@ -12,7 +12,7 @@ from skills.errors import BadInput, Busy, DatabaseBusy, DatabaseUnusable
 from skills.jobs import attempts, watch
 from skills.jobs.attempts import Work
 from skills.jobs.watch import Leases, Watch
-from skills.jobs.worker import _go_round
+from skills.jobs.worker import MISSED_ROUNDS, _go_round
 from skills.library.operation import jobs
 from skills.library.plans import tries
 from skills.library.plans.tries import try_recording
@@ -175,7 +175,7 @@ def test_a_worker_that_restarts_for_the_database_takes_no_attempt(empty_house: H
     given_back: list[str] = []
     unused = Leases(1.0)
     of_worker = Watch(empty_house.database, None, "mine", unused, recover=lambda dead: None)
-    missed = iter([False] * 20 + [True] * 2)
+    missed = iter([False] * MISSED_ROUNDS + [True] * 2)
 
     def step() -> None:
         if not next(missed):
@@ -192,6 +192,6 @@ def test_a_worker_that_restarts_for_the_database_takes_no_attempt(empty_house: H
     monkeypatch.setattr("skills.jobs.worker.os._exit", leave)
     monkeypatch.setattr("skills.jobs.worker.logging.shutdown", lambda: None)
     with pytest.raises(Gone):
-        _go_round(of_worker, lambda: False)
+        _go_round(of_worker, lambda: None, lambda _seconds: False)
     assert given_back == [(row, 1)]
     assert (empty_house.job(row).state, empty_house.job(row).attempt) == ("queued", 2)

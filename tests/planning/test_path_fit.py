@@ -27,10 +27,12 @@ from skills.kinematics import POINTING_DOWN
 from skills.learning.evaluation import dtw
 from skills.learning.policy import Policy, Rollout, learn_tabular, rollout
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.planning.path_fit import FittedPath, fit_to_demo, trace
+from skills.planning import path_fit
+from skills.planning.path_fit import FittedPath, fit_to_demo, hand_along, trace
 from skills.planning.trajectory import PassPath, time_parametrise
 from skills.seeds.recordings import sample_recordings
 from tests.by_day import examples
+from tests.learning.loops import run_both
 
 HAND_OFFS = [(s.name, k) for s in sample_recordings() for k in range(len(s.segments))]
 STEP_MM = 0.5
@@ -369,3 +371,16 @@ def test_the_same_demonstration_gives_the_same_bytes():
     demo, policy = shipped("wren-simple-running", 0)
     one, other = (fitted(demo, policy)[1].tip_mm.tobytes() for _ in range(2))
     assert one == other
+
+
+def test_compiled_loops_agree_with_plain_ones_to_the_last_bit(monkeypatch: pytest.MonkeyPatch):
+    demo, policy = shipped(*HAND_OFFS[0])
+    agreed = run_both(monkeypatch, path_fit, "_descend", "_furthest_mm2")
+    _, fit = fitted(demo, policy)
+    hand = hand_along(demo, fit, turning=False)
+    assert agreed == ["_descend", "_furthest_mm2"]
+    # the same distances, to the whole path
+    moves, off = np.diff(fit.tip_mm, axis=0), hand.tip_mm[:, None] - fit.tip_mm[:-1]
+    part = ((off * moves).sum(axis=2) / (moves**2).sum(axis=1)).clip(0, 1)
+    apart = np.linalg.norm(off - part[..., None] * moves, axis=2).min(axis=1)
+    assert hand.deviation_mm == pytest.approx(apart.max(), abs=1e-9)

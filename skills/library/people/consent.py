@@ -11,9 +11,10 @@ allowed.
 
 import json
 from datetime import date
+from functools import cache
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Row, Text, and_, cast, or_
+from sqlalchemy import BindParameter, ColumnElement, Row, Text, and_, bindparam, cast, or_
 
 from skills.db import now
 from skills.db.models import Surgeon
@@ -68,9 +69,11 @@ def last_day(consent: Consent | None) -> date | None:
 AS_TEXT = cast(Surgeon.consent, Text)
 
 
+@cache
 def covered(use: Use) -> ColumnElement[bool]:
-    """Return `may` as a condition on `Surgeon`; it contains today's date, so build it anew for each query."""
+    """Return `may` as a condition on `Surgeon`; each query has the date of the day on which it is executed."""
     until = Surgeon.consent["until"].as_string()
     # A substring search is exact: besides `uses`, the only text in a consent is a date.
     named = AS_TEXT.contains(json.dumps(use))
-    return or_(AS_TEXT.is_(None), and_(named, or_(until.is_(None), until >= today().isoformat())))
+    day: BindParameter[str] = bindparam(None, callable_=lambda: today().isoformat())
+    return or_(AS_TEXT.is_(None), and_(named, or_(until.is_(None), until >= day)))

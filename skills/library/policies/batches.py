@@ -4,9 +4,9 @@ A style that cannot be learnt fails with its reason, and the others continue. If
 continues its part at the first style without a result; styles that were already started are then trained last, one by
 one, because one of them may have killed the worker.
 
-Slow styles are committed alone. Quick styles are committed a few together, and stored with common statements: a commit
-waits for the disk while it holds its locks (on SQLite the only one of all writers), so with a commit for each style
-several workers would leave no room for others.
+Slow styles are committed alone. Quick styles are committed some together, stored and released with common statements: a
+commit waits for the disk while it holds its locks (on SQLite the only one of all writers), so with a commit for each
+style several workers would leave no room for others.
 """
 
 import logging
@@ -45,7 +45,7 @@ from skills.schemas.training import FitOnTheSame, PolicyFigures, StoredCompariso
 from skills.settings import Settings
 
 TOGETHER = 25  # styles
-TOGETHER_S = 0.5  # the longest time that a result waits for the next one, and that a cancelled batch continues
+TOGETHER_S = 1.0  # the longest time that a result waits for the next one, and that a cancelled batch continues
 NEARLY_ONE = 1 - 1e-9  # the sum of all progress steps, below 1 so that rounding cannot exceed 1
 
 log = logging.getLogger(__name__)
@@ -228,15 +228,18 @@ def _outcomes(
     """Store the learnt policies, each independently, and yield the new values of each style's row."""
     learnt = [one for _, one in ended if isinstance(one, Learnt)]
     measured = _measured(session, learnt, measured)  # again where another version was released since
-    stored = iter(learning.store_styles(session, learnt))
+    of_learnt = dict(zip(learnt, learning.store_styles(session, learnt), strict=True))
+    stored = {one: at for one, at in of_learnt.items() if isinstance(at, Stored)}
+    compared = {one: _compared(one, at, measured.get(one.sha256)) for one, at in stored.items()}
+    if batch.request.release:
+        compared = dict(_release(session, batch, stored, compared, measured))
     for style, one in ended:
-        at = next(stored) if isinstance(one, Learnt) else one
         ending = {"row": style.row, "ended_at": now(), "policy_row": None, "comparison": None, "reason": None}
-        if isinstance(one, Learnt) and isinstance(at, Stored):
-            comparison = _compared(session, batch, one, at, measured.get(one.sha256))
-            yield {**ending, "state": "done", "policy_row": at.row, "comparison": comparison}
+        if isinstance(one, Learnt) and one in stored:
+            yield {**ending, "state": "done", "policy_row": stored[one].row, "comparison": compared[one]}
         else:
-            yield {**ending, "state": "failed", "reason": str(at)[:LONGEST_REASON]}
+            reason = of_learnt[one] if isinstance(one, Learnt) else one
+            yield {**ending, "state": "failed", "reason": str(reason)[:LONGEST_REASON]}
 
 
 # ---- release -----------------------------------------------------------------------------------------------------
@@ -281,19 +284,13 @@ def _measured(session: Session, learnt: Sequence[Learnt], before: Mapping[str, _
     return found
 
 
-def _compared(
-    session: Session, batch: _Batch, learnt: Learnt, stored: Stored, measured: _Measured | None
-) -> StoredComparison:
-    """Return the comparison of a stored version with the released one; release it if requested and it is not worse."""
+def _compared(learnt: Learnt, stored: Stored, measured: _Measured | None) -> StoredComparison:
+    """Return the comparison of a stored version with the released one."""
     trained = figures(stored.version, learnt.sha256, learnt.manifest)
     if measured is None:
-        comparison = compare(None, trained, None)
-    else:
-        served = measured.served
-        comparison = compare(figures(served.version, served.sha256, served.manifest), trained, measured.fit)
-    if batch.request.release:
-        comparison = _release(session, stored.row, comparison, batch)
-    return comparison
+        return compare(None, trained, None)
+    served = measured.served
+    return compare(figures(served.version, served.sha256, served.manifest), trained, measured.fit)
 
 
 def figures(version: int, sha256: str, manifest: PolicyManifest) -> PolicyFigures:
@@ -342,16 +339,26 @@ def _worse(released: PolicyFigures, trained: PolicyFigures, fit: FitOnTheSame) -
         yield f"a start follows {after:.1%} of the demonstration on average against {before:.1%}"
 
 
-def _release(session: Session, policy: int, comparison: StoredComparison, batch: _Batch) -> StoredComparison:
-    if comparison.worse_because:
-        because = f"It is worse than the released version: {'; '.join(comparison.worse_because)}."
-        advice = "Release it by its number if it is to replace the released version anyway."
-        return replace(comparison, not_released_because=because, remedy=advice)
-    version, turn_deg = session.get_one(PolicyVersion, policy), batch.settings.constant_turn_deg
-    made = releases.try_release(session, version, batch.requested_by, turn_deg)
-    return replace(
-        comparison,
-        now_released=made.released,
-        not_released_because=made.not_released_because,
-        remedy=made.remedy,
-    )
+def _release(
+    session: Session,
+    batch: _Batch,
+    stored: Mapping[Learnt, Stored],
+    compared: Mapping[Learnt, StoredComparison],
+    measured: Mapping[str, _Measured],
+) -> Iterator[tuple[Learnt, StoredComparison]]:
+    """Release the versions that are not worse than the released ones; yield the comparisons with the outcome."""
+    by, turn_deg = batch.requested_by, batch.settings.constant_turn_deg
+    better = {one: at for one, at in stored.items() if at.new and not compared[one].worse_because}
+    served = {at.row: m.served if (m := measured.get(one.sha256)) else None for one, at in better.items()}
+    made = releases.release_new(session, served, by, turn_deg)
+    for one, comparison in compared.items():
+        row = stored[one].row
+        if comparison.worse_because:
+            because = f"It is worse than the released version: {'; '.join(comparison.worse_because)}."
+            advice = "Release it by its number if it is to replace the released version anyway."
+            yield one, replace(comparison, not_released_because=because, remedy=advice)
+            continue
+        # a version that was stored before is verified
+        at = made.get(row) or releases.try_release(session, session.get_one(PolicyVersion, row), by, turn_deg)
+        why, remedy = at.not_released_because, at.remedy
+        yield one, replace(comparison, now_released=at.released, not_released_because=why, remedy=remedy)

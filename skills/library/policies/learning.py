@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,6 +85,15 @@ class Lesson:
         """The surgeon's row, and the suture type."""
         return self.surgeon.row, self.suture
 
+    @cached_property
+    def motion(self) -> Demo:
+        """The unpacked demonstration.
+
+        Raises:
+            Corrupt: It does not match its digest.
+        """
+        return unpack_as(Demo, self.demo)
+
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
@@ -99,10 +109,11 @@ class Learnt:
 
 
 class Stored(NamedTuple):
-    """The row and the version number of a stored policy."""
+    """The row and the version number of a stored policy, and whether this transaction has stored it."""
 
     row: int
     version: int
+    new: bool
 
 
 def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
@@ -141,7 +152,7 @@ def with_partners(database: Database, lessons: Sequence[Lesson], parse: Parser) 
         BadRecording: A recording is not cached, and cannot be read any more.
     """
     require(lessons[0].surgeon, "training")  # before a recording is read
-    demos = [unpack_as(Demo, one.demo) for one in lessons]
+    demos = [one.motion for one in lessons]
     arms = {None if demo.partner is None or demo.rotation_xyzw is None else demo.partner.arm for demo in demos}
     if len(arms) > 1 or None in arms:
         return [*lessons]
@@ -171,7 +182,7 @@ def combined_lesson(lessons: Sequence[Lesson], combine: CombineIn | None) -> Les
     if combine is None:
         return lessons[0]
     rewards = [unpack_as(RewardMap, lesson.reward) for lesson in lessons]
-    found = followed([unpack_as(Demo, one.demo) for one in lessons], [reward.path for reward in rewards], combine.kind)
+    found = followed([one.motion for one in lessons], [reward.path for reward in rewards], combine.kind)
     at = found.combined.at
     return replace(
         lessons[at],
@@ -204,7 +215,7 @@ def learn_style(
         BadSettings: It cannot be learnt with these settings.
     """
     require(lesson.surgeon, "training")  # fails early; the check that counts is repeated in the transaction that stores
-    demo, reward = unpack_as(Demo, lesson.demo), unpack_as(RewardMap, lesson.reward)
+    demo, reward = lesson.motion, unpack_as(RewardMap, lesson.reward)
     if (given := request.surroundings) is not None:
         hazards = hazards_of(given.scene, reward.path, demo.frame, given.costs)
         policy = learn_in_scene(reward, scene_learner(request.learner), hazards, request.seed)
@@ -336,7 +347,7 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
         of_style = [states[one.lesson.row] for one in new]
         values = [_version(one, max(of.last or 0, of.used or 0) + 1) for one, of in zip(new, of_style, strict=True)]
         session.execute(insert(PolicyVersion), values)
-        known = find_stored(session, [one.sha256 for one in learnt])
+        known |= find_stored(session, [one.sha256 for one in new], new=True)
         record_events(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
     rests_on = [
         {"policy_row": known[one.sha256].row, "demonstration_row": other} for one in new for other in one.lesson.others
@@ -368,11 +379,11 @@ def demo_states(session: Session, rows: Sequence[int]) -> dict[int, Any]:
     return {one.row: one for one in found}
 
 
-def find_stored(session: Session, digests: Sequence[str]) -> dict[str, Stored]:
+def find_stored(session: Session, digests: Sequence[str], *, new: bool = False) -> dict[str, Stored]:
     """Return those of some policies that are stored, by digest."""
     query = select(PolicyVersion.sha256, PolicyVersion.row, PolicyVersion.version)
     found = session.execute(query.where(PolicyVersion.sha256.in_(digests)))
-    return {sha256: Stored(row, version) for sha256, row, version in found}
+    return {sha256: Stored(row, version, new) for sha256, row, version in found}
 
 
 def _refusal(session: Session, learnt: Learnt, state: Any) -> SkillsError | None:

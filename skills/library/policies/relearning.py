@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 from skills.db.models import PolicyVersion, StoredRecording
 from skills.db.packed import digest, seal, unpack_as
 from skills.db.session import Database
-from skills.demonstration.demonstration import Demo, cut_demo, partner_motion
+from skills.demonstration.demonstration import cut_demo, partner_motion
 from skills.demonstration.partner import PartnerMotion
 from skills.errors import NotFound
 from skills.formats.parsed import ParsedContent
@@ -65,7 +65,7 @@ def compute_again(database: Database, row: int) -> Recomputed:
             return Recomputed(left_out=f"{other}, its certificate was not computed again")
         policy, found = learnt(version), lessons(session, [one.row for one in version.demonstrations])
     lesson = _lesson(version, found)
-    made = certified(lesson, request_of(version.manifest), unpack_as(Demo, lesson.demo), policy)
+    made = certified(lesson, request_of(version.manifest), lesson.motion, policy)
     return Recomputed(_differing(version, policy, made))
 
 

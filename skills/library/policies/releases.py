@@ -11,6 +11,7 @@ somebody releases again.
 
 from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
+from functools import cache
 from typing import Any, NamedTuple
 
 from sqlalchemy import (
@@ -26,14 +27,14 @@ from sqlalchemy import (
     select,
     type_coerce,
 )
-from sqlalchemy.orm import Session, aliased
+from sqlalchemy.orm import Session, aliased, selectinload
 
 from skills.db import now
 from skills.db.changes import announce
 from skills.db.history import HISTORY
 from skills.db.leaves import LEAVES
 from skills.db.models import Demonstration, PolicyVersion, Release, StoredPoses, Surgeon
-from skills.db.service_tables import record_event
+from skills.db.service_tables import record_event, record_events
 from skills.errors import Conflict, NotFound
 from skills.library.operation.history import refuse_edited
 from skills.library.operation.integrity import learnt
@@ -128,8 +129,9 @@ def shares_served(session: Session, suture: str) -> dict[str, float]:
     return {surgeon: float(mean) for surgeon, mean in found}
 
 
+@cache
 def is_served() -> ColumnElement[bool]:
-    """Return a condition on `Release`: its style serves it today; build it anew for each query (it has the date)."""
+    """Return a condition on `Release`: its style serves it on the day on which the query is executed."""
     later = aliased(Release)
     superseded = exists().where(
         later.surgeon_row == Release.surgeon_row,
@@ -163,11 +165,17 @@ def release(
     served = in_force(session, policy.surgeon_row, policy.suture)
     if served and served[0].policy_row == policy.row:
         return served[0]
+    _refuse(session, policy, served[0].policy if served else None, constant_turn_deg)
+    return _add(session, [policy], actor)[0]
+
+
+def _refuse(session: Session, policy: PolicyVersion, served: PolicyVersion | None, constant_turn_deg: float) -> None:
+    """Refuse the release of a version that does not pass the gate; see `release`."""
     reasons = [*policy.manifest.grid_certificate.refused_because, *changed_demonstrations(policy)]
     reasons += _held(policy, constant_turn_deg)
     # Only phased policies have to reproduce their demonstration; one of the cell state must at least not be worse.
-    if policy.manifest.phases == 1 and served:
-        fit = compare_versions(session, served[0].policy, policy)
+    if policy.manifest.phases == 1 and served is not None:
+        fit = compare_versions(session, served, policy)
         if not not_worse(fit):
             text = (
                 "it follows the demonstrations worse than the released one "
@@ -177,9 +185,15 @@ def release(
     if reasons or not policy.releasable:
         text = f"Version {policy.version} cannot be released: {join_reasons(reasons)}."
         raise Conflict(text, remedy(reasons), reasons=[one.text for one in reasons])
-    released = Release(policy=policy, surgeon_row=policy.surgeon_row, suture=policy.suture, released_by=actor)
-    session.add(released)
-    record_event(session, actor, "release", "policy-version", policy.sha256, policy.surgeon)
+
+
+def _add(session: Session, policies: Sequence[PolicyVersion], actor: str) -> list[Release]:
+    """Add the releases of versions that pass the gate, with a few statements for all of them."""
+    released = [
+        Release(policy=one, surgeon_row=one.surgeon_row, suture=one.suture, released_by=actor) for one in policies
+    ]
+    session.add_all(released)
+    record_events(session, actor, "release", "policy-version", [(one.sha256, one.surgeon) for one in policies])
     session.flush()
     announce(session)
     return released
@@ -207,6 +221,31 @@ def try_release(session: Session, policy: PolicyVersion, actor: str, constant_tu
     return Released(True, None, None)
 
 
+def release_new(
+    session: Session, policies: Mapping[int, PolicyVersion | None], actor: str, constant_turn_deg: float
+) -> dict[int, Released]:
+    """Release versions that this transaction has stored, as `try_release` does, with a few statements for all of them.
+
+    Args:
+        session: The caller's transaction. It made the versions, so neither they nor consent are verified again.
+        policies: By the row of each version, of different styles, the version that its style serves.
+        actor: The user who releases them.
+        constant_turn_deg: As in `release`.
+    """
+    found, passed = dict.fromkeys(policies, Released(True, None, None)), []
+    query = select(PolicyVersion).where(PolicyVersion.row.in_(policies))
+    for one in session.scalars(
+        query.options(selectinload(PolicyVersion.demonstration), selectinload(PolicyVersion.others))
+    ):
+        try:
+            _refuse(session, one, policies[one.row], constant_turn_deg)
+            passed.append(one)
+        except Conflict as refused:
+            found[one.row] = Released(False, refused.message, " ".join(refused.advice(None)))
+    _add(session, passed, actor)
+    return found
+
+
 def changed_demonstrations(policy: PolicyVersion) -> list[GateRefusal]:
     """Return the reasons against a release of a version whose demonstration was withdrawn or marked since."""
     return [GateRefusal(change.kind, f"its demonstration {change.text}") for change in policy.objections]
@@ -217,6 +256,8 @@ def _held(policy: PolicyVersion, constant_turn_deg: float) -> list[GateRefusal]:
     driven = policy.manifest.grid_certificate.driven
     if driven is None or driven.orientation == "recorded":
         return []
+    if driven.orientation == "assumed tool-down" and policy.manifest.combined is None:
+        return []  # its demonstration has no orientation, so it does not have to be read
     turns_deg = [turn.deg for one in policy.demonstrations if (turn := departure_of(one.demo)) is not None]
     if all(deg <= constant_turn_deg for deg in turns_deg):  # each, because `max` passes over a NaN
         return []

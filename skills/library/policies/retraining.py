@@ -39,7 +39,7 @@ from skills.schemas.training import RetrainingIn
 
 MOST_IN_A_PART = 50  # styles: the engine's overhead for a part, some 30 ms, is then spread over a second of work
 STYLES_AT_ONCE = 500  # rows that one transaction adds: others wait for it, on SQLite all writers
-FEWEST_PARTS = 16  # if there are so many styles: workers share a batch part by part
+FEWEST_PARTS = 4  # if there are so many styles: workers share a batch part by part
 
 
 def request_retraining(
