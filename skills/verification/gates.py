@@ -138,7 +138,7 @@ def _off_unit(trajectory: Trajectory) -> Floats:
     """Return how far the lengths of a motion's quaternions are from 1, shape (T,)."""
     off = np.abs(np.linalg.norm(trajectory.rotation_xyzw, axis=1) - 1.0)
     if trajectory.psm_m is not None:
-        off[0] = np.maximum(off[0], abs(np.linalg.norm(trajectory.psm_m.base_xyzw) - 1.0))
+        off[0] = np.maximum(off[0], abs(np.linalg.norm(trajectory.psm_m.base_xyzw[None], axis=1)[0] - 1.0))
     return np.asarray(off)
 
 

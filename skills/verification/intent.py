@@ -27,6 +27,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from skills.arithmetic import arccos
 from skills.arrays import Floats
 from skills.kinematics import angle_between, forward, matrix_of
 from skills.planning.motion_laws import Poses
@@ -74,7 +75,7 @@ def _approach_deg(request: RequestedMotion) -> float:
     known = demo.partner is not None
     seen = demo.partner.approach if demo.partner is not None else matrix_of(demo.rotation_xyzw[-1:])[0, :, 0]
     along = [one @ seen for one in (request.approach, matrix_of(np.array([psm_m.base_xyzw]))[0] @ request.approach)]
-    as_stated, in_its_own = np.degrees(np.arccos(np.clip(along if known else np.abs(along), -1.0, 1.0))).tolist()
+    as_stated, in_its_own = np.degrees(arccos(np.clip(along if known else np.abs(along), -1.0, 1.0))).tolist()
     return float(as_stated) if in_its_own <= LIMITS["PSM_M's approach off the demonstrated hand-off"][1] else 0.0
 
 
