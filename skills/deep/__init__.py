@@ -37,7 +37,7 @@ _ADVICE = {
     "contained": "report it with the log",
     "out of memory": "request fewer steps or a smaller batch, or allow more",
     "too much": "which no training does; report it",
-    "failed": "its last output is in the log",
+    "failed": "train again, and report it if it happens again",
     "nonsense": "train again",
 }
 

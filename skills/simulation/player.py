@@ -32,7 +32,7 @@ _ADVICE = {
     "contained": "report it with the log",
     "out of memory": "play fewer passes or allow more",
     "too much": "which no playback does; report it",
-    "failed": "its last output is in the log",
+    "failed": "play it again, and report it if it happens again",
     "nonsense": "play it again, and report it if it happens again",
 }
 

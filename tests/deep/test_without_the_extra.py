@@ -59,7 +59,7 @@ def test_a_lesson_goes_to_the_training_process_and_a_network_comes_back(trained_
     ("fault", "cause", "advice"),
     some([
         ("crash", "crashed", "SIGSEGV; train again"),
-        ("fail", "failed", "code 1; its last output is in the log"),
+        ("fail", "failed", "code 1; train again, and report it if it happens again"),
         ("garbage", "nonsense", "returned unreadable data; train again"),
         ("a_number", "nonsense", "returned unreadable data; train again"),
     ], 4),

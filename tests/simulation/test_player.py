@@ -249,7 +249,7 @@ def test_a_faulty_simulator_is_refused_by_its_fault(fault, cause):
 
 
 def test_its_last_words_are_a_note_and_not_in_the_message():
-    with pytest.raises(SimulationFailed, match="its last output is in the log") as caught:
+    with pytest.raises(SimulationFailed, match="play it again, and report it if it happens again") as caught:
         faulty("fail")
     assert "nobody knows" in caught.value.__notes__[0]
     assert "nobody knows" not in str(caught.value)
