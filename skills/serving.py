@@ -20,6 +20,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from asyncio import TimerHandle, Transport
@@ -284,6 +285,8 @@ def begin(given: int) -> None:
         environment, sys.argv = json.load(file)
     os.environ.clear()
     os.environ.update(environment)
+    tempfile.tempdir = None  # what was imported has asked for it already, without TMPDIR
+    time.tzset()
 
 
 def serve(settings: Settings, *, samples: bool = False) -> None:
