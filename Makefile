@@ -33,6 +33,7 @@ endif
 # Installs a lock into `.venv`: $(1) the lock, $(2) how uv does it, $(3) what it is for. Installers say nothing while they
 # unpack, so every few seconds there is a word on how much has arrived. Nothing of ours opens the models of PyBullet.
 define install
+	@command -v uv >/dev/null 2>&1 || $(IS_PYTHON) || { $(NO_PYTHON); }
 	@echo "Installing $(3) into $(VENV): $$(grep -c '^[a-z].*==' $(1)) packages, once. It takes a minute or more."
 	@while sleep 4; do echo "  $$(du -sm $(VENV) | cut -f1) MB so far"; done & saying=$$!; trap 'kill $$saying' EXIT; \
 	if command -v uv >/dev/null 2>&1; then \

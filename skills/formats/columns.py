@@ -110,7 +110,7 @@ def check_joints(topic: str, joints: Floats) -> None:
     """
     limits = np.where(np.array(UNITS) == "mm", COORDINATE_LIMIT_MM, _JOINT_RAD)
     six, limits = joints[:, : len(limits)], limits[: joints.shape[1]]  # a jaw may follow them
-    wrong = ~(np.abs(six) <= limits)
+    wrong = np.abs(six) > limits  # NaN is refused by name elsewhere
     if wrong.any():
         row, joint = np.argwhere(wrong)[0].tolist()
         raise NotMetres(

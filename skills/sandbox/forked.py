@@ -34,6 +34,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from select import select
+from subprocess import TimeoutExpired
 from threading import Lock
 from typing import IO, Any, BinaryIO, TypeVar
 
@@ -77,11 +78,11 @@ class Fork:
         os.kill(self.pid, signal.SIGKILL)
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end, and return its exit code; raises `subprocess.TimeoutExpired`. Call it once."""
+        """Wait for its end, and return its exit code; raises `TimeoutExpired`. Call it once."""
         ended = os.pidfd_open(self.pid)
         try:
             if not select([ended], [], [], timeout)[0]:
-                raise subprocess.TimeoutExpired("a fork", timeout or 0.0)
+                raise TimeoutExpired("a fork", timeout or 0.0)
             return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         finally:
             os.close(ended)
@@ -102,7 +103,7 @@ class _Server:
         self.control.close()
         try:
             self.process.wait(1.0)
-        except subprocess.TimeoutExpired:
+        except TimeoutExpired:
             self.process.kill()
             self.process.wait()
         shutil.rmtree(self.folder, ignore_errors=True)  # the server does so too, unless it was killed
