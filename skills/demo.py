@@ -26,6 +26,7 @@ from skills.samples import load_samples
 from skills.schemas.operation import Job
 from skills.schemas.playbacks import Playback
 from skills.schemas.policies import Policy
+from skills.schemas.results import PlaybackResult
 from skills.settings import settings
 
 PICTURES = Path("build/demo")
@@ -159,9 +160,7 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
 
 def played(client: Client, job: Job) -> Playback:
     """Wait for a playback in the simulator, and return it."""
-    done = client.wait(job)
-    assert done.result is not None, done
-    return client.playback(done.result["playback"])
+    return client.playback(PlaybackResult.of(client.wait(job)).playback)
 
 
 def cancel_films(client: Client) -> None:

@@ -563,3 +563,29 @@ def test_what_is_printed_for_programs_is_one_document_and_nothing_else(skills, t
         result = CliRunner().invoke(app, [*words, "--json"])
         assert result.exit_code == 0, (words, result.output)
         assert json.loads(result.stdout) is not None, words
+
+
+def test_an_option_that_would_be_ignored_is_refused(skills, tmp_path: Path) -> None:
+    """Before, the last day of a consent, a corrected time and the key of a history were dropped without a word."""
+    file, binary = tmp_path / "hand-off.mcap", tmp_path / "binary"
+    file.write_bytes(write_mcap(exports.session_of()))
+    binary.write_bytes(b"\xff\xfe\x00")
+    style = ("--surgeon", "wren", "--suture", "simple-running")
+    for words, said in (
+        (("surgeon", "put", "wren", "--until", "2030-12-31"), "--until is the last day of a consent"),
+        (("score", str(file), *style, "--proposal", "0"), "hoose one with --proposal"),
+        (("score", str(file), *style, "--proposal", "1", "--start-s", "0.5"), "not both"),
+        (("verify", "--key", "abc+1+2"), "--key is about a replay bag"),
+        (("verify", "--limit", "1"), "--limit is about --relearn"),
+        (("verify", "--head", str(binary)), "is not text in UTF-8"),
+    ):
+        code, printed = skills(*words)
+        assert code == 1 and said in printed, (words, printed)
+
+
+def test_the_table_of_a_folder_repeats_what_was_stated_exactly(skills, tmp_path: Path) -> None:
+    (tmp_path / "one.csv").write_text("x_mm,y_mm,z_mm\n" + "".join(f"{n},{n},0\n" for n in range(40)))
+    stated = tmp_path / "stated.toml"
+    stated.write_text('["*.csv"]\nrate_hz = 29.9700299\ntable_arm = "PSM2"\nframe = "ECM"\n')
+    code, printed = skills("recording", "table", str(tmp_path), "--stated", str(stated))
+    assert code == 0 and "`--rate-hz 29.9700299` `--frame ECM` `--table-arm PSM2`" in printed, printed

@@ -162,7 +162,7 @@ def test_every_form_of_a_text_in_a_request_has_its_words(door: Client):
     document = door.get_json("/openapi.json")
     asked = [
         document["paths"],
-        *(model for name, model in document["components"]["schemas"].items() if re.search(r"In(?![a-z])", name)),
+        *(model for name, model in document["components"]["schemas"].items() if name.endswith("In")),
     ]
     parameters = [
         one for calls in document["paths"].values() for call in calls.values() for one in call.get("parameters", ())

@@ -100,10 +100,21 @@ def test_the_command_of_a_choice_keeps_what_was_typed(bare: None) -> None:
     given = "--surgeon lark --folder 'my folder' --cell-mm 4 --column x=a --column y=b"
     result = run(f"skills try five-hand-offs.mcap {given} --json")
     assert result.exit_code == 1 and "column" in result.output  # an MCAP file takes no columns
-    result = run("skills try five-hand-offs.mcap --surgeon lark --folder 'my folder' --cell-mm 4 --no-release")
+    precise = "--cell-mm 4 --loss-mm 2.1234567"
+    result = run(f"skills try five-hand-offs.mcap --surgeon lark --folder 'my folder' {precise} --no-release")
     assert result.exit_code == 3
-    said = "skills try five-hand-offs.mcap --cell-mm=4 --no-release --surgeon=lark '--folder=my folder' --segment=2\n"
-    assert said in result.stdout, result.stdout
+    said = "skills try five-hand-offs.mcap --loss-mm=2.1234567 --cell-mm=4 --no-release "
+    assert f"{said}--surgeon=lark '--folder=my folder' --segment=2\n" in result.stdout, result.stdout
+
+
+def test_a_try_that_ends_without_a_refused_step_says_why(bare: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("a fault")
+
+    monkeypatch.setattr("skills.library.plans.tries._learn", broken)
+    result = run("skills try hand-off.mcap")
+    assert result.exit_code == 1 and "A recording of" in result.stdout
+    assert "The try failed: " in result.stderr, result.output
 
 
 @pytest.mark.nightly

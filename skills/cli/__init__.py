@@ -5,7 +5,6 @@ are made inside the commands, so that `skills --help` is fast.
 """
 
 import sys
-from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Any
 
@@ -37,18 +36,10 @@ from skills.remedies import did_you_mean
 class Commands(TyperGroup):
     """The command group. Usage errors are printed like all other errors: the fault, then the remedy."""
 
-    def main(
-        self,
-        args: Sequence[str] | None = None,
-        prog_name: str | None = None,
-        complete_var: str | None = None,
-        standalone_mode: bool = True,
-        windows_expand_args: bool = True,
-        **extra: Any,
-    ) -> Any:
+    def main(self, *args: Any, standalone_mode: bool = True, **options: Any) -> Any:
         """Run a command; exit with 2 after a usage error, with 1 if a confirmation is declined."""
         # not in standalone mode, in which Typer prints errors in its own form
-        run = partial(super().main, args, prog_name, complete_var, False, windows_expand_args, **extra)
+        run = partial(super().main, *args, **options | {"standalone_mode": False})
         if not standalone_mode:
             return run()
         try:

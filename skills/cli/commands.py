@@ -134,6 +134,8 @@ def command(
                 where = "The file" if error.filename is None else str(error.filename)
                 refused = BadInput(f"{where}: {error.strerror or error}.", *about_path(error))
                 _exit(refused, run, as_json)
+            except UnicodeDecodeError as error:
+                _exit(BadInput(f"A file that was named is not text in UTF-8: {error}."), run, as_json)
 
         # options without a default need not be before those with one
         run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]

@@ -151,7 +151,9 @@ def _choose_part(client: "Client", path: Path, proposal: int | None, options: Sc
     with ready(path) as (file, progress):
         stored = client.add_recording(file, progress=progress)
     options["recording"] = stored.sha256
-    if proposal is None and {"start_s", "end_s"} & options.keys():
+    if {"start_s", "end_s"} & options.keys():
+        if proposal is not None:
+            raise BadInput("Use --proposal or --start-s and --end-s, not both.")
         return
     arm = options.get("arm")
     arms = sorted({part.arm for part in stored.segments})
@@ -161,7 +163,7 @@ def _choose_part(client: "Client", path: Path, proposal: int | None, options: Sc
             *did_you_mean(arm, arms),
         )
     proposed = [part for part in stored.segments if arm in (None, part.arm)]
-    number = proposal or 1
+    number = 1 if proposal is None else proposal
     if not 1 <= number <= len(proposed) or (proposal is None and len(proposed) > 1):
         raise BadInput(
             f"The recording has {len(proposed)} proposed hand-offs; choose one with --proposal, or give --start-s and "

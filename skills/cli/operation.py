@@ -13,7 +13,7 @@ import typer
 from skills.cli.commands import KEY, command, read_key
 from skills.cli.connecting import installation, service
 from skills.cli.output import Answer, err, outcome, say, status_line, table, warn
-from skills.errors import NotReady, SkillsError
+from skills.errors import BadInput, NotReady, SkillsError
 
 if TYPE_CHECKING:
     from skills.library.operation.erasure_list import Erasures
@@ -275,6 +275,10 @@ def verify(
         relearn: Cut and learn every policy again, from its recordings, settings and seed.
         limit: Of --relearn: at most this number of policies, drawn at random.
     """
+    if key is not None and bag is None:
+        raise BadInput("--key is about a replay bag.", "Name the bag, or leave out --key.")
+    if limit is not None and not relearn:
+        raise BadInput("--limit is about --relearn.", "Add --relearn, or leave out --limit.")
     if bag is not None:
         from skills.formats.verify import verify_bag
 

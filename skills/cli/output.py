@@ -117,6 +117,11 @@ def cell(value: Any) -> str:
     return f"{value:%Y-%m-%d %H:%M:%SZ}" if isinstance(value, datetime) else str(value)
 
 
+def typed(value: object) -> str:
+    """Return a value as it is typed for an option, with all of its digits."""
+    return str(value).removesuffix(".0") if isinstance(value, float) else str(value)
+
+
 def _plain(model: Any) -> Any:
     """Return a model or a path as plain JSON data."""
     return str(model) if isinstance(model, Path) else model.model_dump(mode="json", by_alias=True)

@@ -5,6 +5,7 @@ import typer
 from skills.cli.commands import Surgeon, Suture, command
 from skills.cli.connecting import service
 from skills.cli.output import Answer, table, text
+from skills.errors import BadInput
 from skills.keywords import SurgeonKeywords, SutureTypeKeywords
 
 commands = typer.Typer()
@@ -27,6 +28,8 @@ def surgeon_put(
         consent: A use that the surgeon agreed to: training, export or atlas; repeatable.
         until: The last day of the consent, such as 2030-12-31.
     """
+    if until and not consent:
+        raise BadInput("--until is the last day of a consent.", "Name its uses with --consent.")
     if consent:
         about["consent"] = {"uses": consent, "until": until}
     with service() as client:

@@ -22,7 +22,7 @@ from skills.cli.commands import OfSurgeon, OfSuture, command, first_sentence
 from skills.cli.completion import complete_surgeons
 from skills.cli.connecting import service
 from skills.cli.demos import measured
-from skills.cli.output import Answer, outcome, say, show_table, table, text
+from skills.cli.output import Answer, outcome, say, show_table, table, text, typed
 from skills.cli.uploading import OneEpisode, RecordingPath, Tool, ready_episode, ready_one, refused_of_dataset
 from skills.errors import BadInput, SkillsError
 from skills.keywords import DemoKeywords, TableKeywords
@@ -272,7 +272,7 @@ def _words(stated: "StatedIn") -> Iterator[str]:
     """Yield the options that state the same."""
     for option, value in stated.model_dump(exclude_unset=True, exclude={"source"}).items():
         for one in value if isinstance(value, list) else [value]:
-            yield f"--{option.replace('_', '-')} {one:g}" if isinstance(one, float) else f"--{option} {one}"
+            yield f"--{option.replace('_', '-')} {typed(one)}"
 
 
 def _preview(client: "Client", path: Path, stated: "StatedIn", episode: str | None) -> "RecordingPreview":

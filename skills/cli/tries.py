@@ -22,7 +22,7 @@ from rich.text import Text
 from skills.cli.commands import AsJson, command, on_terminal, parse_tissue
 from skills.cli.completion import complete_surgeons, complete_sutures
 from skills.cli.connecting import WAIT_S, connect
-from skills.cli.output import job_status, out, print_json, say
+from skills.cli.output import job_status, out, print_json, say, typed
 from skills.cli.plans import Approach, Base, arm_errors_of, psm_m_of
 from skills.cli.uploading import OneEpisode, RecordingPath, Tool, ready_one
 from skills.errors import BadInput
@@ -118,7 +118,7 @@ def _installation(folder: Path | None, printer: "_StepPrinter") -> "Iterator[Set
 
 
 def _tried(client: "Client", printer: "_StepPrinter", job: "Job") -> "Job":
-    """Wait for a try, and print each step as it is done; return the job, also one that failed."""
+    """Wait for a try, and print each step as it is done; return the job, also one that ended with a refused step."""
     from skills.client import JobFailed
 
     with job_status(job) as update:
@@ -130,9 +130,10 @@ def _tried(client: "Client", printer: "_StepPrinter", job: "Job") -> "Job":
         try:
             return client.wait(job, WAIT_S, progress=progress)
         except JobFailed as failed:
-            if not failed.job.result:  # it failed before its first step
-                raise
-            return failed.job
+            # the last step says why, unless the job failed otherwise, was cancelled, or goes on
+            if failed.job.result and _steps(failed.job)[-1].text in (failed.job.error or ""):
+                return failed.job
+            raise
 
 
 def _exit_code(client: "Client", job: "Job") -> int:
@@ -235,4 +236,4 @@ def _as_options(name: str, value: object) -> list[str]:
     if isinstance(value, bool):
         return [f"--{option}" if value else f"--no-{option}"]
     values = value if isinstance(value, list | tuple) else [value]
-    return [f"--{option}={one:g}" if isinstance(one, float) else f"--{option}={one}" for one in values]
+    return [f"--{option}={typed(one)}" for one in values]

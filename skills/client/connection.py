@@ -203,10 +203,10 @@ class Connection:
                 failure: Problem | NotReached = problem
                 is_temporary, asked_s = problem.is_temporary, problem.retry_after_s or 0.0
             except httpx.TransportError as error:
-                failed_s = self._clock() - began
+                tried = f"{self._clock() - began:.1f} s and {failed + 1} attempt{'s' if failed else ''}"
+                cause = f" ({error})" if str(error) else ""
                 failure = NotReached(
-                    f"{self.http.base_url} gave no answer in {failed_s:.1f} s and {failed + 1} "
-                    "attempts; check that the service runs there."
+                    f"{self.http.base_url} gave no answer in {tried}{cause}; check that the service runs there."
                 )
                 failure.__cause__ = error
                 is_temporary, asked_s = may_repeat(error, idempotent=idempotent), 0.0

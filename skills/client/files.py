@@ -3,9 +3,8 @@
 import base64
 import hashlib
 import io
-import os
 import re
-import tempfile
+import secrets
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,12 +73,12 @@ class Download:
         self.to, self.sha256 = to, sha256
         self.size_bytes = 0
         self._seen = hashlib.sha256()
+        self._part = to.parent / f".{to.name}.{secrets.token_hex(8)}"
         try:
-            handle, name = tempfile.mkstemp(prefix=f".{to.name}.", dir=to.parent)
+            self._file = self._part.open("xb")
         except OSError as error:
             error.filename = str(to)  # not the temporary name, which means nothing to the user
             raise
-        self._part, self._file = Path(name), os.fdopen(handle, "wb")
 
     def write(self, data: bytes) -> None:
         """Write the next chunk."""
@@ -95,7 +94,6 @@ class Download:
         """
         self._file.close()
         check_digest(self._seen.hexdigest(), self.sha256)
-        self._part.chmod(0o666 & ~_umask())
         self._part.replace(self.to)
 
     def discard(self) -> None:
@@ -138,11 +136,3 @@ def digest_of_etag(etag: str) -> str:
             "The response has no ETag with a digest, so its content cannot be verified; check the proxies in between."
         )
     return found[1]
-
-
-def _umask() -> int:
-    """Return the process's umask, which `mkstemp` does not apply."""
-    # the umask can only be read by setting it
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -118,7 +118,8 @@ class JobFailed(SkillsError):
     """A job did not succeed; `job` is its last state."""
 
     def __init__(self, job: Job, message: str | None = None) -> None:
-        super().__init__(message or f"The {job.kind} {job.state}: {job.error or 'no reason was given'}")
+        ended = "was cancelled" if job.state == "cancelled" else job.state
+        super().__init__(message or f"The {job.kind} {ended}: {job.error or 'no reason was given.'}")
         self.job = job
 
 

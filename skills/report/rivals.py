@@ -118,11 +118,8 @@ SLIPS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3)
 SEED = 0
 OURS, ANEW, CELL = "ours: phase and cell", "ours, started anew where lost", "the paper's state: cell"
 SOLVED = "ours, solved for this slip"
-MOVES_REPLAYED, POSITIONS_REPLAYED, PRIMITIVE = (
-    "replay of moves",
-    "replay of positions by the clock",
-    "dynamic movement primitive",
-)
+MOVES_REPLAYED, POSITIONS_REPLAYED = "replay of moves", "replay of positions by the clock"
+PRIMITIVE = "dynamic movement primitive"
 
 Run = Callable[[Bytes], slip_runs.Walks]
 

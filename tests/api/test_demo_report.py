@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skills.api.pages.filters import share
 from skills.demonstration.recording import Motion, Recording
 from skills.formats import read_recording, write_mcap
 from skills.kinematics import matrix_of, quaternion_of
@@ -62,6 +63,7 @@ def test_a_report_is_a_page_for_people(here: Service, plover: dict):
     for words in (*plover["report"]["advice"], "Path length", "Smoothness", "Turn in A1", "Self-crossings", "Clutch"):
         assert words in page.text
     assert f"{plover['report']['path_length_mm']:.1f} mm" in page.text
+    assert share(plover["report"]["idle_share"], 0) in page.text and "%%" not in page.text
 
 
 def test_a_page_runs_nothing_and_fetches_nothing(here: Service, plover: dict):

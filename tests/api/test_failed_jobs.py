@@ -149,3 +149,14 @@ def test_pictures_that_failed_are_requested_again(told: Service):
 
 def test_an_export_is_not_requested_again_from_what_is_stored_of_it():
     assert again(Job(kind="dataset", request={"episodes": 1})) is None
+
+
+def test_the_bar_of_a_job_that_failed_or_was_cancelled_is_not_full(here: Service):
+    here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    job = here.client.train(**KESTREL)
+    for state, done in (("failed", 0.25), ("cancelled", 0.0)):
+        with here.database.writing() as session:
+            changed = update(Job).where(Job.id == job["id"])
+            session.execute(changed.values(state=state, progress=done, ended_at=Job.created_at))
+        bars = [about for tag, about in page_of(here, f"/pages/jobs/{job['id']}").tags if tag == "progress"]
+        assert [float(bar["value"] or "nan") for bar in bars] == [done], state

@@ -11,7 +11,7 @@ from sqlalchemy import select
 from starlette.testclient import TestClient
 
 from skills.api.pages.assets import BORROWED, assets, build
-from skills.api.pages.filters import number, share, size
+from skills.api.pages.filters import number, share, size, triple
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
 from skills.db.service_tables import Job
 from skills.learning.policy import rollout_from
@@ -266,6 +266,8 @@ def test_the_scripts_of_no_page_exceed_800_kilobytes(told: Service) -> None:
 def test_numbers_are_written_with_their_units_and_never_rounded_up_to_all() -> None:
     assert [number(0.0, "mm"), number(1331), number(12.5, "s"), number(None)] == ["0 mm", "1,331", "12.5 s", "–"]
     assert [share(1.0), share(0.9998), share(0.5), share(None)] == ["100.0 %", "> 99.9 %", "50.0 %", "–"]
+    assert [number(-0.001, "mm"), number(-0.3, digits=0)] == ["0 mm", "0"]
+    assert triple((-0.001, 0.0, -1.5)) == "0.00, 0.00, -1.50 mm"
     assert [size(12), size(2048), size(3 << 20)] == ["12 bytes", "2.0 KiB", "3.0 MiB"]
 
 

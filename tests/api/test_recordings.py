@@ -1,8 +1,13 @@
 """`GET /recordings`: a page of all recordings that the caller may see."""
 
-import pytest
+from dataclasses import replace
 
+import pytest
+from sqlalchemy import select
+
+from skills.db.models import StoredRecording
 from skills.formats import write_mcap
+from skills.library.recordings.recordings import summarise_recording
 from tests.api.service import CSV, KESTREL, Service
 from tests.demonstration import sessions
 from tests.library import cases
@@ -32,3 +37,13 @@ def test_a_line_has_the_counts_of_what_is_in_the_recording(here: Service):
     assert line["duration_s"] == pytest.approx(value.duration_s)
     assert here.http.delete(f"/demos/{demo['id']}").is_success
     assert here.http.get("/recordings").json()["items"][0]["demos"] == 0
+
+
+def test_a_list_counts_every_proposal_of_a_recording(here: Service) -> None:
+    """Before, it counted those that the description holds, at most 200, and contradicted the recording's own page."""
+    here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    with here.database.reading() as session:
+        row = session.scalars(select(StoredRecording)).one()
+        session.expunge(row)
+    row.about = row.about.model_copy(update={"counts": replace(row.about.counts, segments=321)})
+    assert summarise_recording(row, demos=1).segments == 321

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skills.api.pages.filters import share
 from skills.library.comparison.calibrations import calibrate_on, put_calibration, read_cohort
 from skills.seeds.recordings import sample_recordings
 from tests import backends
@@ -124,6 +125,8 @@ def test_a_trial_is_rated_with_its_interval_its_terms_and_its_thirds(scoring: Se
     assert "Of the whole recording, as a trial of Suturing." in text and "First third" in text and "<h2>Rating" in text
     for term in skill["terms"]:
         assert f'<th scope="row">{term["label"]}</th>' in text
+        if term["name"].endswith("_share"):  # in percent, as in the table of figures
+            assert f'data-name="Here">{share(term["value"], 0)}</td>' in text
     assert "nan" not in text.lower().replace("nanometre", "")
 
 

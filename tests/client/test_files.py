@@ -109,3 +109,13 @@ def test_an_async_upload_reports_progress_in_the_calling_thread(tmp_path: Path):
                 "add_recording", file, progress=lambda *_: where.add(threading.get_ident())
             )
     assert where == {threading.get_ident()}
+
+
+@both
+def test_a_download_has_the_modes_of_the_umask_and_never_changes_it(made, tmp_path: Path, monkeypatch):
+    """Before, the umask was 0 for a moment: files that other threads made meanwhile could be written by everyone."""
+    monkeypatch.setattr("os.umask", lambda _: pytest.fail("the umask is of all threads"))
+    plain = tmp_path / "plain"
+    plain.touch()
+    to = made(Script(named(BAG)), Time())("save_replay_bag", "p" * 64, tmp_path / "bag.zip")
+    assert to.stat().st_mode == plain.stat().st_mode

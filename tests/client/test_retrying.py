@@ -141,3 +141,11 @@ def test_requests_on_its_own_connection_wait_as_long_as_its_calls(kind):
     """Before, `client.http` gave up after the 5 s of httpx, whatever `timeout_s` said."""
     assert kind("http://127.0.0.1:8000").http.timeout == httpx.Timeout(60.0)
     assert kind("http://127.0.0.1:8000", timeout_s=7.0).http.timeout == httpx.Timeout(7.0)
+
+
+@both
+def test_no_answer_names_its_cause_and_counts_its_attempts(made):
+    for cause in ("certificate verify failed: self-signed certificate", "Name or service not known"):
+        with pytest.raises(NotReached) as failed:
+            made(Script(httpx.ConnectError(cause)), Time(), retrying=Retrying(attempts=1))("surgeons")
+        assert cause in failed.value.message and "1 attempt " in failed.value.message

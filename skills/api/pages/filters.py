@@ -31,7 +31,7 @@ def number(value: float | None, unit: str = "", digits: int = 2) -> str:
     """Return a number with its unit, rounded, and without a fraction if that is 0."""
     if value is None:
         return MISSING
-    text = f"{value:,.{digits}f}" if isinstance(value, float) else f"{value:,}"
+    text = f"{value:z,.{digits}f}" if isinstance(value, float) else f"{value:,}"
     if "." in text:
         text = text.rstrip("0").rstrip(".")
     return f"{text} {unit}".strip()
@@ -41,7 +41,7 @@ def triple(values: Sequence[float] | None, unit: str = "mm", digits: int = 2) ->
     """Return the coordinates x, y and z with their unit."""
     if values is None:
         return MISSING
-    return ", ".join(f"{value:.{digits}f}" for value in values) + f" {unit}"
+    return ", ".join(f"{value:z.{digits}f}" for value in values) + f" {unit}"
 
 
 def moment(value: datetime | str | None) -> str:

@@ -468,7 +468,7 @@ def summarise_recording(row: StoredRecording, demos: int) -> described.Recording
         format=row.format,
         duration_s=row.about.duration_s,
         arms=sorted({motion.arm for motion in row.about.motions}),
-        segments=len(row.about.segments),
+        segments=row.about.counts.segments,
         demos=demos,
         created_at=row.created_at,
     )
