@@ -308,6 +308,20 @@ def test_an_outcome_is_marked_on_the_page_of_its_style(flat: Watched, client: Cl
     client.release(SAMPLE.surgeon, SAMPLE.suture, 1)
 
 
+def test_points_on_a_line_are_at_least_one_and_at_most_50(flat: Watched) -> None:
+    """Before, a negative number removed every point, and a large one stopped the page."""
+    flat.open("/pages/plans/new")
+    points = flat.page.locator("#points tr")
+    expect(points).to_have_count(5)
+    for wrong in ("-3", "5000"):
+        flat.page.locator("#line-count").fill(wrong)
+        flat.page.get_by_role("button", name="Lay").click()
+        assert points.count() == 5
+    flat.page.locator("#line-count").fill("3")
+    flat.page.get_by_role("button", name="Lay").click()
+    expect(points).to_have_count(3)
+
+
 def test_an_erasure_waits_until_the_pseudonym_is_typed(tab: Watched, client: Client) -> None:
     page, dialog = tab.page, tab.page.get_by_role("dialog")
     client.put_surgeon("siskin")

@@ -66,10 +66,12 @@ export async function digestOf(file) {
 export function send(path, file, headers, query, tell, request = new XMLHttpRequest()) {
   const done = new Promise((resolve, reject) => {
     request.upload.onprogress = ({ loaded, total }) => tell(loaded, total);
-    request.onload = async () =>
-      request.status < 300 ? resolve(JSON.parse(request.responseText)) : reject(await problemOf(request.status, request.responseText));
-    request.onerror = () => reject(new Error("The connection was lost; send it again. Nothing was stored."));
-    request.onabort = () => reject(new Error("Stopped; nothing was stored."));
+    request.onload = () => resolve(request);
+    request.onerror = () => reject(new Error("The connection was lost; send it again. A file that was stored already is not stored twice."));
+    request.onabort = () => reject(new Error("Stopped."));
+  }).then(async ({ status, responseText: text }) => {
+    if (status >= 300) throw await problemOf(status, text);
+    return JSON.parse(text);
   });
   request.open("POST", `${root}${path}?${query}`);
   for (const [name, value] of Object.entries({ ...headers, ...changing() })) request.setRequestHeader(name, value);

@@ -1,5 +1,6 @@
 // The plan editor: suture points in a table and in a view from above, with one list behind both. Passes count from 0, as in reports.
 import { call, root } from "./api.js";
+import { drawing as element } from "./site.js";
 
 const form = document.getElementById("plan");
 const get = (id) => document.getElementById(id);
@@ -82,13 +83,6 @@ function floor() {
   const high = low.map((one, i) => one + grid.cell_mm * grid.shape[i]);
   return [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]].map(([x, y]) => [x, y, goal[2]]);
 }
-
-const element = (name, attributes, text) => {
-  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  if (text !== undefined) made.textContent = text;
-  return made;
-};
 
 let scale = 1;
 let width = 560;
@@ -201,7 +195,9 @@ get("add").addEventListener("click", () => {
   points.push({ ...last, at: [last.at[0] + Number(get("line-x").value), last.at[1] + Number(get("line-y").value), last.at[2]] });
   show();
 });
-get("lay").addEventListener("click", () => lay(Number(get("line-count").value) || 1, Number(get("line-x").value), Number(get("line-y").value)));
+get("lay").addEventListener("click", () => {
+  if (get("line-count").reportValidity()) lay(Number(get("line-count").value) || 1, Number(get("line-x").value), Number(get("line-y").value));
+});
 addEventListener("resize", draw);
 get("style").addEventListener("change", ({ target }) => {
   const [surgeon, suture, version] = target.value.split("/");

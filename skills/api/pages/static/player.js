@@ -1,8 +1,8 @@
 // The player: one clock for the 3-D view and the plots of one or two motions.
 import { call } from "./api.js";
 import { Plot } from "./plot.js";
-import { Scene, bodies, dots, layerList, line } from "./scene.js";
-import { element, say } from "./site.js";
+import { Scene, bodies, dots, lastOf, layerList, line } from "./scene.js";
+import { element, percent, say } from "./site.js";
 
 const get = (id) => document.getElementById(id);
 const player = get("player");
@@ -117,7 +117,7 @@ function stage(motions) {
     still.push({ layer: "trails", thing: line(trail, { ...look, width: 1.5, opacity: 0.35 }) });
     const seen = line(trail, { ...look, width: 2.5, name, hover: null, shown: 0, bounds: false });
     const first = trail.findIndex((one) => !Number.isNaN(one));
-    const last = trail.findLastIndex((one) => !Number.isNaN(one)) - 2;
+    const last = lastOf(trail);
     if (first >= 0) {
       still.push({ layer: "marks", thing: dots(trail.slice(first, first + 3), { colour: "start", symbol: "diamond", size: 6, name: `start of ${name}` }) });
       still.push({ layer: "marks", thing: dots(trail.slice(last, last + 3), { colour: "goal", symbol: "cross", size: 6, name: `end of ${name}` }) });
@@ -204,7 +204,7 @@ function tell(rows) {
     if (motion.stages.length) lines.push([m ? "Stage of the second" : "Stage", stage || "–"]);
     if (motion.clutch_s.length) lines.push(["Clutch", clutch ? "down" : "up"]);
     for (const arm of motion.arms) lines.push([`${arm.arm}${m ? ", second" : ""}`, `${number(arm.speed_mm_s[row], "mm/s")}${arm.jaw_rad ? `, jaw ${number((arm.jaw_rad[row] * 180) / Math.PI, "°")}` : ""}`]);
-    for (const trace of motion.traces) lines.push([trace.name, trace.unit ? number(trace.values[row], trace.unit) : percent(trace.values[row])]);
+    for (const trace of motion.traces) lines.push([trace.name, trace.unit ? number(trace.values[row], trace.unit) : Number.isNaN(trace.values[row]) ? "–" : percent(trace.values[row], 1)]);
     return lines;
   });
   const text = JSON.stringify(lines);
@@ -220,7 +220,6 @@ function tell(rows) {
 }
 
 const number = (value, unit) => (Number.isNaN(value) ? "–" : `${value.toFixed(1)}\u00a0${unit}`);
-const percent = (value) => (Number.isNaN(value) ? "–" : `${(Math.floor(1000 * value) / 10).toFixed(1)} %`);
 
 function tick(at) {
   if (!playing) return;
@@ -276,8 +275,8 @@ function plotAll() {
 
 function restage() {
   if (motions[1]) {
-    const [a, b] = motions.map((motion) => [0, 1, 2].map((k) => motion.arms[0].tip_mm[3 * (motion.rows - 1) + k]));
-    motions[1].shift = get("place").value === "end" ? a.map((one, k) => one - b[k]) : [0, 0, 0];
+    const [a, b] = motions.map(({ arms: [{ tip_mm: tips }] }) => tips.slice(lastOf(tips), lastOf(tips) + 3));
+    motions[1].shift = get("place").value === "end" ? Array.from(a, (one, k) => one - b[k]) : [0, 0, 0];
   }
   staged = stage(motions);
 }

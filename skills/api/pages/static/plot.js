@@ -59,7 +59,7 @@ export class Plot {
         if (values[i] * scale < low) low = values[i] * scale;
         if (values[i] * scale > high) high = values[i] * scale;
       }
-      if (limit !== undefined && limit !== null) low = Math.min(low, limit);
+      if (limit !== undefined && limit !== null) [low, high] = [Math.min(low, limit), Math.max(high, limit)];
     }
     if (!(high > low)) return Number.isFinite(low) ? [low - 1, low + 1] : [0, 1];
     return [low, high + 0.05 * (high - low)];

@@ -1,5 +1,5 @@
 // What was understood of a recording, drawn as tables from the answer of POST /recordings/preview.
-import { element, rowOf } from "./site.js";
+import { element, percent, rowOf } from "./site.js";
 
 const number = (value, unit, digits = 1) => (value === null ? "–" : `${Number(value.toFixed(digits))} ${unit}`);
 const counted = (count, one, many = `${one}s`) => `${count.toLocaleString("en")} ${count === 1 ? one : many}`;
@@ -28,7 +28,7 @@ function facts(seen) {
     ["Format", seen.format, INTEGRITY[seen.integrity]],
     ["Duration", number(seen.duration_s, "s", 2), seen.timed ? "" : "it has no times"],
     ...seen.motions.filter((one) => one.duplicate_stamps).map((one) => ["Repeated stamps", counted(one.duplicate_stamps, "sample"), `dropped of ${one.topic}`]),
-    ...(seen.dropped ?? []).map((one) => ["Stamps that went back", counted(one.backward_stamps, "sample"), `dropped of ${one.topic}`]),
+    ...seen.dropped.map((one) => ["Stamps that went back", counted(one.backward_stamps, "sample"), `dropped of ${one.topic}`]),
     ...Object.entries(seen.tools).map(([arm, tool]) => [`Instrument of ${arm}`, tool, "as stated"]),
     ...seen.left_out.map((one) => ["Left out", one.topic, one.because]),
   ];
@@ -38,7 +38,7 @@ function facts(seen) {
 function motions(seen) {
   const rows = seen.motions.map((one, k) => {
     const quality = seen.quality[k];
-    const equal = quality.equal_samples ? `${quality.equal_samples} (${((100 * quality.equal_samples) / one.samples).toFixed(0)} %)` : "none";
+    const equal = quality.equal_samples ? `${quality.equal_samples} (${percent(quality.equal_samples / one.samples)})` : "none";
     return [one.arm, one.topic, one.frame, one.samples.toLocaleString("en"), number(quality.rate_hz, "Hz"), quality.extent_mm.map((side) => side.toFixed(1)).join(", ") + " mm", equal];
   });
   return table(["Arm", "Topic", "Frame", "Samples", "Rate", "Extent x, y, z", "Repeat a pose"], rows, "Motions");
@@ -50,7 +50,7 @@ function instrument({ instrument: name, generation, candidates }) {
 }
 
 function identified(seen) {
-  if (!seen.identifications?.length) return element("p", { className: "small" }, "No joints beside poses, so arm and instrument cannot be identified.");
+  if (!seen.identifications.length) return element("p", { className: "small" }, "No joints beside poses, so arm and instrument cannot be identified.");
   const rows = seen.identifications.map(({ arm, topic, found }) => [
     arm, topic, found.verdict, instrument(found), `${found.residual_mm.toFixed(3)}\u00a0mm`, found.reason,
   ]);

@@ -1,6 +1,6 @@
 // The list of proposed hand-offs: accepts, corrects and rejects them, and draws their paths.
 import { call } from "./api.js";
-import { confirmed, element } from "./site.js";
+import { confirmed, drawing, element } from "./site.js";
 
 const chosen = document.getElementById("cut");
 const items = [...document.querySelectorAll(".proposals > li")];
@@ -13,8 +13,10 @@ if (chosen) {
   for (const [field, value] of [[surgeon, kept.surgeon], [suture, kept.suture], [session, kept.session]]) {
     if (value && (field.tagName === "INPUT" || [...field.options].some((one) => one.value === value))) field.value = value;
   }
+  const askNew = () => (document.getElementById("new").hidden = surgeon.value !== "+");
+  askNew();
   chosen.addEventListener("change", () => {
-    document.getElementById("new").hidden = surgeon.value !== "+";
+    askNew();
     sessionStorage.setItem(KEPT, JSON.stringify({ surgeon: surgeon.value, suture: suture.value, session: session.value }));
   });
   chosen.addEventListener("submit", (event) => event.preventDefault());
@@ -33,7 +35,7 @@ async function surgeonOf(item) {
   if (named && named !== wanted && !(await confirmed({ what: `Is this hand-off ${wanted}'s?`, means, yes: "Yes, cut it" }))) return null;
   if (surgeon.value === "+") {
     if (![...surgeon.options].some((one) => one.value === wanted)) {
-      await call("PUT", `/surgeons/${wanted}`, {});
+      await call("PUT", `/surgeons/${wanted}`, {}, { "If-None-Match": "*" }); // never in place of one that there is
       surgeon.add(new Option(wanted, wanted), surgeon.options.length - 1);
     }
     surgeon.value = wanted;
@@ -105,16 +107,11 @@ function draw(svg, points) {
   const [low, high] = [0, 1].map((k) => seen.map((one) => one[k])).reduce(([lows, highs], values) => [[...lows, Math.min(...values)], [...highs, Math.max(...values)]], [[], []]);
   const scale = 84 / Math.max(high[0] - low[0], high[1] - low[1], 1);
   const at = ([u, v]) => [50 + scale * (u - (low[0] + high[0]) / 2), 50 - scale * (v - (low[1] + high[1]) / 2)].map((one) => one.toFixed(1));
-  const made = (name, attributes) => {
-    const one = document.createElementNS("http://www.w3.org/2000/svg", name);
-    Object.entries(attributes).forEach((pair) => one.setAttribute(...pair));
-    return one;
-  };
   const [first, last] = [at(seen[0]), at(seen.at(-1))];
   svg.replaceChildren(
-    made("polyline", { class: "path", points: seen.map((one) => at(one).join(",")).join(" ") }),
-    made("circle", { class: "start", cx: first[0], cy: first[1], r: 3 }),
-    made("circle", { class: "goal", cx: last[0], cy: last[1], r: 4 }),
+    drawing("polyline", { class: "path", points: seen.map((one) => at(one).join(",")).join(" ") }),
+    drawing("circle", { class: "start", cx: first[0], cy: first[1], r: 3 }),
+    drawing("circle", { class: "goal", cx: last[0], cy: last[1], r: 4 }),
   );
 }
 

@@ -1,6 +1,6 @@
 // A recording's timeline, and the form that cuts a hand-off out of it and trains it.
 import { call, root, watch } from "./api.js";
-import { confirmed, jobLine, rowOf } from "./site.js";
+import { confirmed, drawing as element, jobLine, rowOf } from "./site.js";
 
 const get = (id) => document.getElementById(id);
 const cut = get("cut");
@@ -44,13 +44,6 @@ function choose(index) {
   if (radio) radio.checked = true;
   set(segment.start_s, segment.end_s);
 }
-
-const element = (name, attributes, text) => {
-  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  if (text !== undefined) made.textContent = text;
-  return made;
-};
 
 let at = (seconds) => seconds;
 let secondsAt = (x) => x;

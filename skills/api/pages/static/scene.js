@@ -32,6 +32,9 @@ const GRAB_PX = 14;
 
 const flat = (points) => (ArrayBuffer.isView(points) ? points : Float32Array.from(points.flatMap((one) => one ?? [NaN, NaN, NaN])));
 
+// Where the last recorded position begins in a column; before and after a recording it is NaN.
+export const lastOf = (points) => points.findLastIndex((one) => !Number.isNaN(one)) - 2;
+
 // A line through points, [x, y, z] each, or all numbers in a Float32Array; null or NaN is a gap.
 export function line(points, { name, width = 2, dash = "solid", ...more }) {
   return { kind: "line", points: flat(points), name, width, dash, ...more };

@@ -1,5 +1,5 @@
 // Behaviour of every page: light and dark theme, buttons that make a call, confirmations, times, and polled parts.
-import { call, save, watch, root } from "./api.js";
+import { ACTIVE, call, save, watch, root } from "./api.js";
 
 const page = document.documentElement;
 const themes = { "": "◐ auto", light: "☀ light", dark: "☾ dark" };
@@ -40,6 +40,20 @@ export function element(name, properties, ...inside) {
   return made;
 }
 
+// Make an element of a drawing.
+export function drawing(name, attributes, text) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text !== undefined) made.textContent = text;
+  return made;
+}
+
+// A share in percent, as the filter `share` words it: less than all is never 100 %.
+export function percent(share, digits = 0) {
+  const text = (100 * share).toFixed(digits);
+  return share < 1 && Number(text) >= 100 ? `> ${(100 - 10 ** -digits).toFixed(digits)} %` : `${text} %`;
+}
+
 // Make a row of a table of figures, as the macro `row` does.
 export function rowOf(name, value, meaning) {
   const cell = element("td", {}, element("span", { className: "number" }, value), element("span", { className: "meaning" }, ` ${meaning}`));
@@ -77,7 +91,7 @@ export function jobLine(near) {
   near.after(line);
   return (job) => {
     if (job.state === "running" && job.progress > 0) bar.value = job.progress;
-    if (!["queued", "running"].includes(job.state)) bar.value = 1;
+    if (!ACTIVE.includes(job.state)) bar.value = job.state === "succeeded" ? 1 : (job.progress ?? 0);
     words.textContent = job.error ? `${job.state}: ${job.error}` : job.state;
     line.classList.toggle("wrong", job.state === "failed");
   };
@@ -158,7 +172,8 @@ async function renew(part) {
     if (!answer?.ok) continue;
     const now = new DOMParser().parseFromString(await answer.text(), "text/html").getElementById(part.id);
     if (!now) return;
-    if (now.innerHTML !== part.innerHTML && !part.contains(document.activeElement)) part.replaceChildren(...now.childNodes);
+    if (part.contains(document.activeElement)) continue; // the focus would be lost
+    if (now.innerHTML !== part.innerHTML) part.replaceChildren(...now.childNodes);
     if (now.dataset.renew) part.dataset.renew = now.dataset.renew;
     else delete part.dataset.renew;
   }

@@ -1,7 +1,7 @@
 // The 3-D view of a style: the recorded motion, its path in the grid, and the learnt policy, by layers.
 import { call } from "./api.js";
 import { Scene, box, dots, layerList, line, shade } from "./scene.js";
-import { say } from "./site.js";
+import { percent, say } from "./site.js";
 
 const place = document.getElementById("style");
 const { view: address, rollouts, version } = place.dataset;
@@ -81,11 +81,6 @@ function learnt({ path_mm: points, number }) {
   ];
 }
 
-// Less than all is never 100 %.
-function percent(part) {
-  return `${Math.floor(100 * part)} %`;
-}
-
 // The cells from which the policy reaches the goal; those from which it does not are crosses, in every colouring.
 function starts() {
   const { at_mm: at, reaches, nearest, moves, share } = view.starts;
@@ -125,7 +120,7 @@ function prepareStarts() {
       moves: () => `■ blue is near, yellow far: 0 to ${Math.max(...moves)} moves to the goal; `,
       kind: () => `■ ${count(nearest)} join the path in the fewest moves, ◆ ${count(reaches.map((yes, i) => yes && !nearest[i]))} take a longer way, `,
     };
-    get("starts-key").textContent = `${words[get("starts-of").value]()}✕ ${lost} do not reach it.${every > 1 ? ` Every ${every}th cell along each axis is shown.` : ""}`;
+    get("starts-key").textContent = `${words[get("starts-of").value]()}✕ ${lost} do not reach it.${every > 1 ? ` One cell in ${every} along each axis is shown.` : ""}`;
   };
   key();
   get("starts-of").addEventListener("change", () => {
