@@ -35,7 +35,7 @@ endif
 define install
 	@command -v uv >/dev/null 2>&1 || $(IS_PYTHON) || { $(NO_PYTHON); }
 	@echo "Installing $(3) into $(VENV): $$(grep -c '^[a-z].*==' $(1)) packages, once. It takes a minute or more."
-	@while sleep 4; do echo "  $$(du -sm $(VENV) | cut -f1) MB so far"; done & saying=$$!; trap 'kill $$saying' EXIT; \
+	@while sleep 4; do echo "  $$(du -sm $(VENV) 2>/dev/null | cut -f1) MB so far"; done & saying=$$!; trap 'kill $$saying' EXIT; \
 	if command -v uv >/dev/null 2>&1; then \
 	  { uv venv -q --allow-existing --python $(PYTHON) $(VENV) || { $(NO_PYTHON); }; } && \
 	  $(SETUPTOOLS) | VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --require-hashes -r - && \

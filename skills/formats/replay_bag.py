@@ -1,7 +1,7 @@
 """The replay bag for a robot or a simulator: for each automatic segment of a plan a bag folder of each arm that moves.
 
-    Trajectory --arms_of--> ArmMotion --segments_of, folders_of--> 000-A1/PSM1/metadata.yaml, 000-A1/PSM1/PSM1.mcap ...
-                                      --index_of--> what comes when, who moves, and what must be true before
+    Trajectory --arms_of--> ArmMotion --segment_motions, folder_of--> 000-A1/PSM1/PSM1.mcap ...
+                                      --segment_index--> what comes when, who moves, and what must be true before
     files --seal--> one zip
 
 Each arm has three topics, with one message on each of them for every sample, stamped with the sample's time:
@@ -247,7 +247,9 @@ def folder_of(motion: ArmMotion, plan_sha256: str) -> dict[str, bytes]:
     return {f"{motion.segment}/{name}": data for name, data in made.items()}
 
 
-def parts_of(trajectory: Trajectory, arms: Sequence[ArmMotion]) -> list[tuple[AutomaticSegment, list[ArmMotion]]]:
+def segment_motions(
+    trajectory: Trajectory, arms: Sequence[ArmMotion]
+) -> list[tuple[AutomaticSegment, list[ArmMotion]]]:
     """Return each segment with what each arm does in it."""
     return [
         (one, [arm.part(one.samples, f"{number:03d}-{one.kind}") for arm in arms])
@@ -255,12 +257,11 @@ def parts_of(trajectory: Trajectory, arms: Sequence[ArmMotion]) -> list[tuple[Au
     ]
 
 
-def index_of(trajectory: Trajectory, arms: Sequence[ArmMotion], plan_sha256: str) -> SegmentIndex:
+def segment_index(segments: Sequence[tuple[AutomaticSegment, list[ArmMotion]]], plan_sha256: str) -> SegmentIndex:
     """Return what comes when, who moves, and what must be true before each segment.
 
     Args:
-        trajectory: The one that `arms` are made of.
-        arms: The result of `arms_of`.
+        segments: The result of `segment_motions`.
         plan_sha256: The digest of the plan.
     """
     return SegmentIndex(
@@ -276,11 +277,11 @@ def index_of(trajectory: Trajectory, arms: Sequence[ArmMotion], plan_sha256: str
                 from_ns=int(parts[0].stamps_ns[0]),
                 to_ns=int(parts[0].stamps_ns[-1]),
                 by_hand=list(one.by_hand),
-                teleoperated=[arm.name for arm in arms] if one.by_hand else [],
-                needle_held_by=held_by(one.kind, len(arms)),
+                teleoperated=[part.name for part in parts] if one.by_hand else [],
+                needle_held_by=held_by(one.kind, len(parts)),
                 arms=[part.start(0, moves=part.moves) for part in parts],
             )
-            for one, parts in parts_of(trajectory, arms)
+            for one, parts in segments
         ],
     )
 

@@ -28,7 +28,7 @@ ROUND_OFF = 2e-9  # rad and mm: a joint may be as far beyond its limit as `inver
 # One count of the encoders of a PSM, rad and mm, from the gear ratios in the configuration generator of the dVRK's
 # controller: 14400 x 56.5 counts a turn (yaw, pitch), 14400 x 336.6 for 360 x 17.4533 mm, 4000 x 11.71 a turn (wrist).
 COUNT = np.array([7.72e-6, 7.72e-6, 1.296e-3, *[1.341e-4] * 3])
-JOLT_S = 0.01  # ours: a wave of 50 Hz turns from one such step to the next
+WAVE_S = 0.01  # ours: a wave of 50 Hz turns from one such step to the next
 NEEDLE_TO_ARM = "distance of the needle from the other arm"
 SCENE = "clearance of the scene"  # the quantity of a failure beside tissue or an obstacle
 
@@ -38,9 +38,9 @@ class ArmSamples:
     """The joints of one arm, each array of shape (T, 6).
 
     `joints` are in rad and mm, `margins` are parts of the joints' ranges, `speed` and `acceleration` are parts of their
-    limits; `jerk` is the change of acceleration in `JOLT_S`, as a part of the same limit. `jolt` is the amplitude of a
-    wave of 50 Hz in five samples `JOLT_S` apart: a sixteenth of their fourth difference, which is 0 of every cubic, in
-    counts of the encoder, at the last of the five.
+    limits; `jerk` is the change of acceleration in `WAVE_S`, as a part of the same limit. `vibration` is the amplitude
+    of a wave of 50 Hz in five samples `WAVE_S` apart: a 16th of their fourth difference, which is 0 of every cubic,
+    in counts of the encoder, at the last of the five.
     """
 
     name: str
@@ -50,7 +50,7 @@ class ArmSamples:
     speed: Floats
     acceleration: Floats
     jerk: Floats
-    jolt: Floats
+    vibration: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +120,9 @@ def _arm(name: str, joints: Floats, instrument: str, rate_hz: float) -> ArmSampl
     tool = kinematics.instrument_of(instrument)
     speed, acceleration = joint_ratios(joints, np.zeros(len(joints), np.int64), rate_hz, instrument)
     margins = kinematics.joint_margins(joints, instrument) / (tool.upper - tool.lower)
-    step = max(1, round(JOLT_S * rate_hz))
+    step = max(1, round(WAVE_S * rate_hz))
     third, fourth = (_differences(joints, step, order) for order in (3, 4))
-    jerk = third * (rate_hz / step) ** 3 * JOLT_S / tool.acceleration[:6]
+    jerk = third * (rate_hz / step) ** 3 * WAVE_S / tool.acceleration[:6]
     return ArmSamples(name, tool, joints, margins, speed, acceleration, jerk, fourth / 16 / COUNT)
 
 
@@ -168,7 +168,8 @@ class Limits:
         jerk_ratio: Greatest change of a joint's acceleration in 0.01 s, as a part of its limit. A hand that is averaged
             over a quarter of a second by a Hann window changes by 16 times its own acceleration per second, 0.16, and
             what is averaged may be twice what is left.
-        jolt_counts: Greatest amplitude of a vibration of 50 Hz, in counts of the joint's encoder: the arm sees no less.
+        vibration_counts: Greatest amplitude of a vibration of 50 Hz, in counts of the joint's encoder, of which an arm
+            sees no part.
         tracking_mm: Greatest servo error; the simulator's own is under 0.001 mm, and in contact it is millimetres.
         goal_mm: Greatest servo error at the end of each pass.
         alignment_deg: Greatest error of the jaw's rotation at the end of each pass.
@@ -189,7 +190,7 @@ class Limits:
     speed_ratio: float = 1.000001
     acceleration_ratio: float = 1.000001
     jerk_ratio: float = 0.32
-    jolt_counts: float = 1.0
+    vibration_counts: float = 1.0
     tracking_mm: float = 0.1
     goal_mm: float = 0.05
     alignment_deg: float = 0.1
@@ -349,7 +350,7 @@ def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
         accelerations = arm.acceleration[:, joint]
         yield _Gate(f"acceleration of {prefix}{name}", "of its limit", accelerations, limits.acceleration_ratio)
         yield _Gate(f"jerk of {prefix}{name}", "of the acceleration", arm.jerk[:, joint], limits.jerk_ratio)
-        yield _Gate(f"jolt of {prefix}{name}", "encoder counts", arm.jolt[:, joint], limits.jolt_counts)
+        yield _Gate(f"vibration of {prefix}{name}", "encoder counts", arm.vibration[:, joint], limits.vibration_counts)
 
 
 def _clearance_gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:

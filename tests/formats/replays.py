@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, index_of, parts_of, seal
+from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, seal, segment_index, segment_motions
 from skills.formats.verify import JUDGED, verify_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
@@ -94,7 +94,9 @@ def papers(made: Trajectory, **changes: Any) -> dict[str, bytes]:
         "report": report,
     } | changes.get("verdict", {})
     policy = {"version": 3, "sha256": "2" * 64} | changes.get("policy", {})
-    index = index_of(made, arms(made), "1" * 64).model_dump(mode="json") | changes.get("index", {})
+    index = segment_index(segment_motions(made, arms(made)), "1" * 64).model_dump(mode="json") | changes.get(
+        "index", {}
+    )
     files = {"plan.json": plan, "verdict.json": verdict, "policy.json": policy, "segments.json": index}
     return {name: json.dumps(paper).encode() for name, paper in files.items()} | {"README.txt": b"Read me.\n"}
 
@@ -111,7 +113,7 @@ def arms(made: Trajectory) -> tuple[ArmMotion, ...]:
 
 def folders(made: Trajectory, moving: Sequence[ArmMotion], plan: str = "1" * 64) -> dict[str, bytes]:
     """Return the files of the arms in each segment."""
-    moved = (part for _, parts in parts_of(made, moving) for part in parts if part.moves)
+    moved = (part for _, parts in segment_motions(made, moving) for part in parts if part.moves)
     return {name: data for part in moved for name, data in folder_of(part, plan).items()}
 
 

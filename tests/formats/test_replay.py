@@ -133,7 +133,7 @@ def test_the_same_trajectory_gives_the_same_bytes():
 
 def test_the_index_of_two_passes_by_hand():
     """Two passes of 81 samples at 200 Hz, 60 of A1 and 21 of A2, a second apart; stamps begin at 1 s."""
-    index = replay_bag.index_of(trajectory(), arms(trajectory()), "1" * 64)
+    index = replay_bag.segment_index(replay_bag.segment_motions(trajectory(), arms(trajectory())), "1" * 64)
     assert [(one.name, one.pass_index, one.from_ns, one.to_ns, one.by_hand) for one in index.segments] == [
         ("000-A1", 0, 1_000_000_000, 1_295_000_000, ["M1", "M2"]),
         ("001-A2", 0, 1_295_000_000, 1_400_000_000, []),
@@ -167,9 +167,15 @@ def test_a_hand_over_is_a_segment_in_which_both_arms_stand():
             assert one.last - one.first == pytest.approx(2e2 * JAW_S, abs=2)
         else:
             assert (np.ptp(a.jaw_rad), np.ptp(m.jaw_rad)) == (0, 0)
-    held = [one.needle_held_by for one in replay_bag.index_of(motion, (psm_a, psm_m), "1" * 64).segments]
+    held = [
+        one.needle_held_by
+        for one in replay_bag.segment_index(replay_bag.segment_motions(motion, (psm_a, psm_m)), "1" * 64).segments
+    ]
     assert held == ["PSM_A", "PSM_A", "PSM_A", "PSM_M", "PSM_A", "PSM_A", "PSM_A"]
-    assert [one.moves for one in replay_bag.parts_of(motion, (psm_a, psm_m))[0][1]] == [True, False]  # only PSM_A in A1
+    assert [one.moves for one in replay_bag.segment_motions(motion, (psm_a, psm_m))[0][1]] == [
+        True,
+        False,
+    ]  # only PSM_A in A1
 
 
 def test_sha256sum_itself_reads_the_checksums(tmp_path):

@@ -67,7 +67,7 @@ def test_a_flipped_byte_of_the_archive_is_found_by_its_own_checksums():
 def rewritten(change: Any, name: str = "PSM2") -> dict[str, bytes]:
     """Return the files of a bag in which one arm's messages were changed, with all checksums correct."""
     files = members()
-    for _, (part,) in replay_bag.parts_of(trajectory(), [arm(name)]):
+    for _, (part,) in replay_bag.segment_motions(trajectory(), [arm(name)]):
         said = [one for one in map(change, replay_bag.messages_of(part)) if one is not None]
         made = bag_folder(said, name, replay_bag.notes_of(part, "1" * 64))
         files = files | {f"{part.segment}/{file}": data for file, data in made.items()}
@@ -76,7 +76,7 @@ def rewritten(change: Any, name: str = "PSM2") -> dict[str, bytes]:
 
 def remade(motion: replay_bag.ArmMotion, plan: str = "1" * 64) -> dict[str, bytes]:
     moving = [motion if motion.name == one.name else one for one in arms(trajectory())]
-    index = replay_bag.index_of(trajectory(), moving, "1" * 64).model_dump(mode="json")
+    index = replay_bag.segment_index(replay_bag.segment_motions(trajectory(), moving), "1" * 64).model_dump(mode="json")
     return papers(trajectory(), index=index) | folders(trajectory(), moving, plan)
 
 
@@ -178,7 +178,7 @@ NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 
 @pytest.mark.parametrize(("names", "frame"), [((*NAMES[:4], "wrist_yaw", "wrist_pitch"), ""), (NAMES, "ECM"), ((), "")])
 def test_other_names_of_joints_or_frames_are_found(names, frame):
-    parts = [part for _, (part,) in replay_bag.parts_of(trajectory(), [arm()])]
+    parts = [part for _, (part,) in replay_bag.segment_motions(trajectory(), [arm()])]
     joints = iter(row for part in parts for row in part.joints.tolist())
     speeds = iter(row for part in parts for row in replay_bag.velocities_of(part.stamps_ns, part.joints).tolist())
 
@@ -239,7 +239,7 @@ def test_arms_that_changed_places_are_found():
     with pytest.raises(BadBag, match=r"PSM1.mcap has the topic '/PSM2/setpoint_js'"):
         checked({moved(name): data for name, data in members().items()})
     other = replay_bag.arms_of(trajectory(), arm="PSM1", frame=FRAME, jaw_rad=0.1)
-    index = replay_bag.index_of(trajectory(), other, "1" * 64).model_dump(mode="json")
+    index = replay_bag.segment_index(replay_bag.segment_motions(trajectory(), other), "1" * 64).model_dump(mode="json")
     with pytest.raises(BadBag, match="The plan is for PSM2, but the bag has another PSM_A"):
         checked(papers(trajectory(), index=index) | folders(trajectory(), other))
 
@@ -314,7 +314,7 @@ def test_segments_that_begin_elsewhere_than_the_one_before_ended_are_found():
     tip_mm, rotation = forward(in_mm(jumped.joints), jumped.instrument)
     jumped = replace(jumped, tip_m=tip_mm / 1000.0, rotation_xyzw=quaternion_of(rotation))
     moving = (jumped, arm("PSM1"))
-    index = replay_bag.index_of(trajectory(), moving, "1" * 64).model_dump(mode="json")
+    index = replay_bag.segment_index(replay_bag.segment_motions(trajectory(), moving), "1" * 64).model_dump(mode="json")
     with pytest.raises(BadBag, match=r"not the index of this bag, at '002-A1'"):
         checked(papers(trajectory(), index=index) | folders(trajectory(), moving))
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from skills.errors import BadBag, BadSignature, SkillsError
-from skills.formats.replay_bag import arms_of, index_of, seal
+from skills.formats.replay_bag import arms_of, seal, segment_index, segment_motions
 from skills.formats.verify import SIGNATURE, verify_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
@@ -68,7 +68,7 @@ BESIDE: Any = short().psm_m
 def bag_of(made: Trajectory, arm: str = "PSM2", **changes: Any) -> Files:
     """Return the files of a bag without signature, in which everything agrees."""
     arms = arms_of(made, arm=arm, frame=FRAME, other="PSM1" if arm == "PSM2" else "PSM2")
-    index = index_of(made, arms, PLAN).model_dump(mode="json")
+    index = segment_index(segment_motions(made, arms), PLAN).model_dump(mode="json")
     said = papers(made, **({"report": {"trajectory": MOTION, "arms": judged(made)}, "index": index} | changes))
     return said | folders(made, arms)
 

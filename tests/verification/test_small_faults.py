@@ -141,14 +141,14 @@ def jerked(by_mm_s2: float) -> faults.Fault:
 
 SHAKEN = {
     **{
-        f"0.004 mm at 50 Hz along {axis}": (shaken(50.0, 0.004 * way, A1), "jolt of ")
+        f"0.004 mm at 50 Hz along {axis}": (shaken(50.0, 0.004 * way, A1), "vibration of ")
         for axis, way in (("x", X), ("y", Y), ("z", Z))
     },
-    "0.004 mm at 50 Hz in A2": (shaken(50.0, 0.004 * X, A2), "jolt of "),
-    "0.004 mm at 50 Hz in a transfer": (shaken(50.0, 0.004 * Z, TRANSFER), "jolt of "),
-    "0.01 mm at 25 Hz": (shaken(25.0, 0.01 * Z, A1), "jolt of "),
-    "0.004 mm at 50 Hz of PSM_M": (shaken(50.0, 0.004 * Z, A1, "m_tip"), "jolt of PSM_M's "),
-    "the wrist by 0.02 degrees at 50 Hz": (shaken_wrist, "jolt of "),
+    "0.004 mm at 50 Hz in A2": (shaken(50.0, 0.004 * X, A2), "vibration of "),
+    "0.004 mm at 50 Hz in a transfer": (shaken(50.0, 0.004 * Z, TRANSFER), "vibration of "),
+    "0.01 mm at 25 Hz": (shaken(25.0, 0.01 * Z, A1), "vibration of "),
+    "0.004 mm at 50 Hz of PSM_M": (shaken(50.0, 0.004 * Z, A1, "m_tip"), "vibration of PSM_M's "),
+    "the wrist by 0.02 degrees at 50 Hz": (shaken_wrist, "vibration of "),
     "a jerk": (jerked(170.0), "jerk of "),
     "a jerk backwards": (jerked(-170.0), "jerk of "),
 }
@@ -161,7 +161,7 @@ def test_a_vibration_is_named_at_its_beginning(name):
     first = plant(changed)
     failure = failure_of(changed.built())
     assert failure is not None
-    assert failure.quantity.startswith((quantity, quantity.replace("jolt", "jerk")))
+    assert failure.quantity.startswith((quantity, quantity.replace("vibration", "jerk")))
     assert first <= failure.sample <= first + 14
 
 
@@ -292,7 +292,7 @@ def test_the_other_arm_at_the_needle_is_named(number):
     near = needle_from_arm(moved, 0.5)
     first = int(np.argmax(near < 0.5))
     assert rows[0] <= first <= sample
-    loose = Limits(speed_ratio=1e9, acceleration_ratio=1e9, jerk_ratio=1e9, jolt_counts=1e9)
+    loose = Limits(speed_ratio=1e9, acceleration_ratio=1e9, jerk_ratio=1e9, vibration_counts=1e9)
     failure = judge(ideal(moved), moved, loose, pad_is_tissue=False).failure
     assert (failure.quantity, failure.sample) == (NEEDLE_TO_ARM, first)
     assert (needle_from_arm(motion, 0.5) >= 0.5).all()

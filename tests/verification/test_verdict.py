@@ -295,7 +295,7 @@ def test_the_limits_are_those_that_the_documents_state():
         "speed_ratio": 1.000001,
         "acceleration_ratio": 1.000001,
         "jerk_ratio": 0.32,
-        "jolt_counts": 1.0,
+        "vibration_counts": 1.0,
         "tracking_mm": 0.1,
         "goal_mm": 0.05,
         "alignment_deg": 0.1,
@@ -390,7 +390,7 @@ def test_a_margin_of_the_joints_is_a_part_of_their_range(joint, side):
     measured = np.array(TRAJECTORY.joints)
     measured[SAMPLE, joint] = ((1 - part) * tool.lower + part * tool.upper)[joint]
     near = replace(ideal_playback(TRAJECTORY), joints=measured)
-    free = Limits(speed_ratio=1e9, acceleration_ratio=1e9, jerk_ratio=1e9, jolt_counts=1e9, insertion_mm=0.0)
+    free = Limits(speed_ratio=1e9, acceleration_ratio=1e9, jerk_ratio=1e9, vibration_counts=1e9, insertion_mm=0.0)
     assert judge(near, TRAJECTORY, replace(free, joint_margin=0.019)).feasible
     assert failed(judge(near, TRAJECTORY, replace(free, joint_margin=0.021))) == (JOINTS[joint], SAMPLE)
 
@@ -401,7 +401,7 @@ def test_a_joint_may_be_at_its_limit_and_no_further(joint, side):
     limit = getattr(instrument_of(TRAJECTORY.instrument), side)[joint]
     outwards = 1e-8 if side == "upper" else -1e-8
     measured = np.array(TRAJECTORY.joints)
-    free = Limits(speed_ratio=1e9, acceleration_ratio=1e9, jerk_ratio=1e9, jolt_counts=1e9, insertion_mm=-1.0)
+    free = Limits(speed_ratio=1e9, acceleration_ratio=1e9, jerk_ratio=1e9, vibration_counts=1e9, insertion_mm=-1.0)
     measured[SAMPLE, joint] = limit
     assert judge(replace(ideal_playback(TRAJECTORY), joints=measured), TRAJECTORY, free).feasible
     measured[SAMPLE, joint] = limit + outwards

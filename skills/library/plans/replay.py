@@ -20,13 +20,13 @@ from skills.db.models import Plan, StoredPlayback
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import Corrupt
-from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, held_jaw_rad, index_of, parts_of, seal
+from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, held_jaw_rad, seal, segment_index, segment_motions
 from skills.formats.verify import PLAN, POLICY, README, SEGMENTS, SIGNATURE, VERDICT
 from skills.library.operation import proofs
 from skills.library.operation.integrity import learnt, learnt_in, planned
 from skills.library.plans.description import describe_motion, describe_plan
 from skills.library.plans.headline import OF_WORLDS, counted_as, describe_errors, not_judged
-from skills.library.plans.plans import find_plan, motion_of, trajectory_of
+from skills.library.plans.plans import find_plan, followed_plan, trajectory_of
 from skills.library.plans.replay_gate import ReplayConditions, cleared
 from skills.library.policies.combined import learnt_from
 from skills.planning.handoff import JAW_CLOSED_RAD
@@ -70,12 +70,13 @@ def replay_bag(database: Database, plan_sha256: str, conditions: ReplayCondition
         rows = (("plans", row.row), ("playbacks", verdict.row), ("policy_versions", policy.row))
     if digest(trajectory) != report.trajectory:
         raise Corrupt("A stored motion is not the one that its verdict judged; restore it from a backup.")
-    index = index_of(trajectory, arms, row.sha256)
+    segments = segment_motions(trajectory, arms)
+    index = segment_index(segments, row.sha256)
     papers[SEGMENTS] = {"use": USE, **index.model_dump(mode="json")}
     members = {name: _written(paper) for name, paper in papers.items()}
     head = proofs.head_over(database, rows)
     members[README] = _readme(row, about, report, arms, index, head).encode()
-    for part in (part for _, parts in parts_of(trajectory, arms) for part in parts if part.moves):
+    for part in (part for _, parts in segments for part in parts if part.moves):
         members |= folder_of(part, row.sha256)
     members[SIGNATURE] = proofs.sign_files(
         database.history,
@@ -100,9 +101,10 @@ def describe_segments(session: Session, plan_sha256: str) -> SegmentIndex:
         NotFound: There is no such plan.
         Conflict: The surgeon's consent does not cover training.
     """
-    row = find_plan(session, plan_sha256)
-    trajectory = trajectory_of(motion_of(session, plan_sha256))
-    return index_of(trajectory, _arms(row, planned(row), trajectory), row.sha256)
+    row = followed_plan(session, plan_sha256)
+    plan = planned(row)
+    trajectory = trajectory_of(plan)
+    return segment_index(segment_motions(trajectory, _arms(row, plan, trajectory)), row.sha256)
 
 
 def _arms(row: Plan, plan: SuturePlan, trajectory: Trajectory) -> tuple[ArmMotion, ...]:
