@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import httpx2 as httpx
 import pytest
@@ -54,9 +54,10 @@ class Service:
         }
         self.command = [sys.executable, "-m", "skills", "serve", "--port", str(self.port)]
         self.process: subprocess.Popen[bytes] | None = None
+        self.printed: IO[bytes] | None = None
 
     def launch(self) -> None:
-        self.process = subprocess.Popen(self.command, env=self.environment)
+        self.process = subprocess.Popen(self.command, env=self.environment, stdout=self.printed)
 
     def start(self) -> None:
         self.launch()
