@@ -207,8 +207,8 @@ def write_answer(
         value = Refusal.of(error)
     except MemoryError:  # `skills.sandbox.perform` reports it by its exit code
         raise
-    except PermissionError as error:  # as well; the message names a file
-        raise PermissionError(error.errno, "refused").with_traceback(error.__traceback__) from None
+    except OSError as error:  # likewise, by its number; its message names a file
+        raise OSError(error.errno, "refused").with_traceback(error.__traceback__) from None
     except Exception as error:  # a bug: its message may quote the file, and must not be logged
         raise RuntimeError(type(error).__name__).with_traceback(error.__traceback__) from None
     packing.write(answer, value, KNOWN)

@@ -54,10 +54,10 @@ class Service:
         }
         self.command = [sys.executable, "-m", "skills", "serve", "--port", str(self.port)]
         self.process: subprocess.Popen[bytes] | None = None
-        self.printed: IO[bytes] | None = None
+        self.stdout: IO[bytes] | None = None
 
     def launch(self) -> None:
-        self.process = subprocess.Popen(self.command, env=self.environment, stdout=self.printed)
+        self.process = subprocess.Popen(self.command, env=self.environment, stdout=self.stdout)
 
     def start(self) -> None:
         self.launch()

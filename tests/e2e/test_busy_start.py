@@ -36,7 +36,7 @@ def test_every_style_of_the_samples_is_released_or_shown_failed(tmp_path: Path, 
     service = Service(tmp_path, workers=2)
     service.command.append("--samples")
     printed = tmp_path / "printed.txt"
-    with busy_processes(), printed.open("wb") as service.printed:
+    with busy_processes(), printed.open("wb") as service.stdout:
         try:
             service.start()
             until(lambda: "samples are" in printed.read_text(), by=[service.process] if service.process else [])

@@ -50,6 +50,7 @@ def try_out(fault: Fault, seed: int) -> tuple[str, bool]:
         try:
             row = run(fault, Path(folder), seed)
         except AssertionError as error:
+            print(*error.__notes__, sep="\n")
             return f"| {fault.words} | NOT RECOVERED: {error} | | | | | | | |", True
     for what in (row.bugs, row.verdict.lost, row.verdict.doubled, row.verdict.wrong, row.verdict.given_up):
         print(*what[:20], sep="\n", end="\n" if what else "")

@@ -4,6 +4,7 @@ Every fault is a function of a running `Site`; it is over when the function retu
 """
 
 import errno
+import json
 import os
 import random
 import resource
@@ -407,7 +408,12 @@ def _site(fault: Fault, folder: Path, seed: int) -> Iterator[Site]:
             site.services.append(service)
             stack.callback(_stop, service)
             service.start()
-        yield site
+        try:
+            yield site
+        except AssertionError as error:
+            for service in site.services:
+                error.add_note("\n".join(json.dumps(one) for one in service.lines() if one["level"] != "info"))
+            raise
 
 
 def _stop(service: Installation) -> None:

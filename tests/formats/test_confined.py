@@ -1,5 +1,6 @@
 """Reading in a confined process: the same recording or refusal as in this process, and all failures are refusals."""
 
+import errno
 import io
 import json
 import logging
@@ -181,6 +182,17 @@ def test_a_fault_of_ours_is_logged_without_the_file_in_it(monkeypatch):
         reader_process.read(io.BytesIO(), io.BytesIO())
     assert caught.value.__suppress_context__
     assert caught.traceback[-1].name == "broken"
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES])
+def test_an_error_of_the_system_keeps_its_number_and_loses_its_file(monkeypatch, number):
+    def broken(_file: IO[bytes]) -> None:
+        raise OSError(number, "no", "Zaphod.db3")
+
+    monkeypatch.setattr(reader_process, "read_recording", broken)
+    with pytest.raises(OSError, match="refused") as caught:
+        reader_process.read(io.BytesIO(), io.BytesIO())
+    assert (caught.value.errno, "Zaphod" in str(caught.value)) == (number, False)
 
 
 def test_too_many_at_once_are_told_to_come_back(reader, caplog):

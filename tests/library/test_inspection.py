@@ -11,6 +11,7 @@ from skills.db.models import Demonstration, ParsedChunk, RecordingChunk
 from skills.db.packed import Packed
 from skills.db.service_tables import DatasetChunk, Event
 from skills.db.session import Database
+from skills.errors import StorageFull
 from skills.library.comparison.measuring import far_apart
 from skills.library.operation import inspection
 from skills.library.operation.inspection import AGREES, VERIFIED, WITH_OTHERS, inspect_installation, packed_values
@@ -239,3 +240,13 @@ def test_a_file_whose_pages_are_damaged_is_told(damaged: Database, tmp_path: Pat
         data[place : place + 16] = b"\xff" * 16
     file.write_bytes(data)
     assert any(what == "database file" for what, _ in looked_at(damaged)[1])
+
+
+def test_what_a_full_disk_keeps_from_being_decoded_is_left_out(damaged: Database):
+    def parse(*_: object, **__: object) -> None:
+        raise StorageFull("The disk is full.")
+
+    parts = {part.what: part for part in inspect_installation(damaged, parse)}  # type: ignore[arg-type]
+    assert not any(part.wrong for part in parts.values())
+    ((name, why),) = parts["recordings decoded"].left_out
+    assert (name.split()[0], why, parts["recordings decoded"].count) == ("recordings", "The disk is full.", 1)

@@ -26,7 +26,7 @@ from skills.db.packed import Packed, digest
 from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import DatasetChunk, ErasedSurgeon, Job, StoredDataset
 from skills.db.session import Database
-from skills.errors import Busy, Corrupt, NotFound, SkillsError
+from skills.errors import Busy, Corrupt, NotFound, SkillsError, StorageFull
 from skills.formats.parsed import parse_recording
 from skills.formats.reader_process import READER_VERSION
 from skills.gridworld.reward import sparse_reward
@@ -273,8 +273,12 @@ def _decoded_again(database: Database, parse: Parser, every: bool) -> Iterator[C
     with checked.noting(checked.what), database.reading() as session:
         rows = session.scalars(query if every else query.limit(1)).all()
     for row in rows:
-        with checked.noting(f"recordings {row}"):
-            checked.wrong += [(f"recordings {row}", why) for why in _decoded_otherwise(database, row, parse)]
+        name = f"recordings {row}"
+        try:
+            with checked.noting(name):
+                checked.wrong += [(name, why) for why in _decoded_otherwise(database, row, parse)]
+        except StorageFull as full:  # of temporary files: all else is verified on a full disk too
+            checked.left_out.append((name, full.message))
         checked.count += 1
         yield checked
     yield checked
