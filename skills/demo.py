@@ -2,8 +2,8 @@
 
 It uploads the sample recordings of synthetic surgeons, cuts the hand-offs that the service proposes, trains and
 releases, downloads the policies, rolls them out, stacks five suture points and plays the plan in PyBullet; then it does
-the same with a real recording, if one is available. It exits with 0 only if every sample style is followed exactly,
-from every start, by a motion that the arm can make.
+the same with a real recording, if one is available. It exits with 0 only if every sample style is followed exactly from
+its own start, reaches its goal from every start, and is a motion that the arm can make.
 """
 
 import os
@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from skills.client import Client, JobFailed, Problem
+from skills.fields import percent
 from skills.samples import load_samples
 from skills.schemas.operation import Job
 from skills.schemas.playbacks import Playback
@@ -133,7 +134,8 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
     """Train, release, roll out, plan and play a style, and add a row to the report.
 
     Returns:
-        Whether the style is followed exactly, from every start, and feasible; and the playback's digest.
+        Whether the style is followed exactly from its own start, reaches its goal from every start and is feasible,
+        and the playback's digest.
     """
     laps = [time.monotonic()]
     client.wait(client.train(surgeon, suture, release=True))
@@ -150,7 +152,7 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
         f"{surgeon} {suture}",
         f"{policy.metrics.exact_states}/{policy.metrics.path_states}",
         f"{total:g}",
-        f"{coverage.mean_share:.0%}",
+        f"{percent(coverage.mean_share)}%",
         verdict(playback),
         *(f"{after - before:.2f}" for before, after in pairwise(laps)),
     )
@@ -230,7 +232,7 @@ def real_recording(client: Client) -> None:
     metrics, coverage = policy.metrics, policy.coverage
     out.print(
         f"{metrics.exact_states} of {metrics.path_states} states, DTW {metrics.dtw_total_mm:g} mm, "
-        f"{coverage.mean_share:.0%} of the demonstration from a start on average; "
+        f"{percent(coverage.mean_share)}% of the demonstration from a start on average; "
         + ("released." if result["released"] else f"not released: {result['not_released_because']}")
     )
     try:

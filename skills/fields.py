@@ -35,6 +35,17 @@ Six = Annotated[tuple[float, ...], Field(min_length=6, max_length=6)]
 # NaN where it could not be measured, which is null in JSON.
 Figure = float | None
 
+
+def percent(share: float, digits: int = 0) -> str:
+    """Return a share as a number of percent: less than all is never rounded to 100, nor more than nothing to 0."""
+    text, least = f"{100 * share:.{digits}f}", 10**-digits
+    if share < 1 and float(text) >= 100:
+        return f"> {100 - least:.{digits}f}"
+    if share > 0 and float(text) <= 0:
+        return f"< {least:.{digits}f}"
+    return text
+
+
 if TYPE_CHECKING:
     from numpy import float32
     from numpy.typing import NDArray

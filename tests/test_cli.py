@@ -577,6 +577,7 @@ def test_an_option_that_would_be_ignored_is_refused(skills, tmp_path: Path) -> N
         (("score", str(file), *style, "--proposal", "1", "--start-s", "0.5"), "not both"),
         (("verify", "--key", "abc+1+2"), "--key is about a replay bag"),
         (("verify", "--limit", "1"), "--limit is about --relearn"),
+        (("verify", str(binary), "--relearn"), "are about the installation, not about a bag"),
         (("verify", "--head", str(binary)), "is not text in UTF-8"),
     ):
         code, printed = skills(*words)

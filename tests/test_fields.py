@@ -4,10 +4,11 @@ from dataclasses import dataclass
 from importlib import import_module
 from pkgutil import iter_modules
 
+import pytest
 from pydantic import Field, TypeAdapter
 
 import skills.schemas
-from skills.fields import Count, Documented, Point, as_json, computed_field, documented, schema
+from skills.fields import Count, Documented, Point, as_json, computed_field, documented, percent, schema
 
 
 @schema
@@ -113,3 +114,18 @@ def test_docstrings_of_models_describe_only_fields_that_there_are():
         if kind.__module__.startswith("skills.schemas") and kind.__doc__ and not is_made(kind):
             assert documented(kind)[1].keys() <= kind.model_fields.keys(), kind
     assert {"TrainingIn", "PolicyManifest"} <= seen
+
+
+@pytest.mark.parametrize(
+    ("share", "digits", "text"),
+    [
+        (1.0, 0, "100"),
+        (0.996, 0, "> 99"),
+        (0.0, 0, "0"),
+        (0.004, 0, "< 1"),
+        (0.9996, 1, "> 99.9"),
+        (0.12345, 1, "12.3"),
+    ],
+)
+def test_less_than_all_is_not_100_percent_and_some_are_not_0(share: float, digits: int, text: str):
+    assert percent(share, digits) == text

@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skills.cli import app
+from skills.client import NotReached
 from skills.settings import settings
 from tests.formats.gathered import gather_others, gather_samples
 
@@ -76,3 +77,15 @@ def test_statements_that_cannot_be_used_are_refused(installation: None, tmp_path
     result = CliRunner().invoke(app, ["recording", "table", str(tmp_path), "--stated", str(stated)])
     assert result.exit_code == 1
     assert why in result.stderr
+
+
+def test_an_outage_is_no_refusal_of_a_recording(installation: None, tmp_path: Path, monkeypatch) -> None:
+    gather_samples(tmp_path / "all")
+
+    def away(*_: object, **__: object) -> None:
+        raise NotReached("The service sent no response.")
+
+    monkeypatch.setattr("skills.cli.recordings._preview", away)
+    result = CliRunner().invoke(app, ["recording", "table", str(tmp_path / "all")])
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "The service sent no response." in result.stderr

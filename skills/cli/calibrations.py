@@ -84,18 +84,19 @@ def _show_validation(found: "Calibration") -> None:
 
 
 def _show_task(judged: "TaskValidation") -> None:
+    from skills.fields import percent
     from skills.scoring.validation import RIVALS, SEEN
 
     def figures(label: str, row: "Judged") -> tuple[str, ...]:
         right: tuple[str, ...] = ()
         if row.accuracy is not None and row.accuracy_interval is not None:
-            right = (f"{100 * row.accuracy:.0f} %", _span(row.accuracy_interval))
+            right = (f"{percent(row.accuracy)} %", _span(row.accuracy_interval))
         return label, f"{row.rho:.2f}", _span(row.rho_interval), *right
 
     chance = judged.chance
     by_chance: tuple[str, ...] = ("chance", f"{chance.rho:.2f}", f"p = {chance.rho_p:.3f}")
     if chance.accuracy is not None:
-        by_chance += (f"{100 * chance.accuracy:.0f} %", f"p = {chance.accuracy_p:.3f}")
+        by_chance += (f"{percent(chance.accuracy)} %", f"p = {chance.accuracy_p:.3f}")
     rows = [
         figures("the model", judged.model),
         *(figures(label, judged.rivals[name]) for name, label in RIVALS.items() if name not in SEEN),

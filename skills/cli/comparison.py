@@ -53,10 +53,12 @@ def _show_atlas(suture: str, found: "Atlas") -> None:
 
 
 def _show_tables(found: "Atlas") -> None:
+    from skills.fields import percent
+
     surgeons = [
         one.model_dump()
         | {"medoid": one.medoid[:SHORT], "consistency": _rounded(one.spread)}
-        | {"share": None if one.mean_share is None else f"{one.mean_share:.0%}"}
+        | {"share": None if one.mean_share is None else f"{percent(one.mean_share)}%"}
         for one in found.surgeons
     ]
     show_table(surgeons, ("surgeon", "demos", "recordings", "sessions", "consistency", "share", "medoid"))
@@ -75,11 +77,14 @@ def _show_tables(found: "Atlas") -> None:
 
 def _recognition(recognition: "list[Recognition]", because: str | None) -> Iterator[str]:
     """Yield a sentence for each arm, and why there is no recognition."""
+    from skills.fields import percent
+
     for seen in recognition:
         low, high = seen.interval
         yield (
             f"recognition on {seen.arm}: {seen.right} of {seen.tested} with their session left out, "
-            f"{seen.accuracy:.0%} ({low:.0%} to {high:.0%}), by chance {seen.chance:.0%}; log loss "
+            f"{percent(seen.accuracy)}% ({percent(low)}% to {percent(high)}%), by chance "
+            f"{percent(seen.chance)}%; log loss "
             f"{seen.log_loss:.2f} nat, guessing {seen.log_loss_of_guessing:.2f}; by {', '.join(seen.compared)}"
         )
     if because is not None:
@@ -87,13 +92,15 @@ def _recognition(recognition: "list[Recognition]", because: str | None) -> Itera
 
 
 def _say_recognised(found: "Atlas") -> None:
+    from skills.fields import percent
+
     say(*_recognition(found.recognition, found.no_recognition_because))
     if found.votes is not None:
-        say(f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%}")
+        say(f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {percent(found.votes.accuracy)}%")
     if (one := found.recognised) is not None:
-        likely = ", ".join(f"{of.surgeon} {of.probability:.0%}" for of in one.likely[:3])
+        likely = ", ".join(f"{of.surgeon} {percent(of.probability)}%" for of in one.likely[:3])
         voted = f"; its recording votes for {one.voted} ({one.voters})" if one.voted else ""
-        none = f"none of these {one.none_of_these:.0%}"
+        none = f"none of these {percent(one.none_of_these)}%"
         say(f"{one.demo[:SHORT]} of {one.surgeon}, {one.arm}: {likely}; {none}{voted}")
     if found.recognition:
         say("Set-up and day are confounded with the surgeon: see docs/atlas.md.")
@@ -106,14 +113,16 @@ def recognise(recording: str, suture: TheSuture) -> Answer:
     Args:
         recording: The digest of a recording that has a demonstration.
     """
+    from skills.fields import percent
+
     with service() as client:
         found = client.recognise(recording, suture)
     low, high = found.votes.interval
     return text(
         found,
         f"{found.recording[:SHORT]} of {found.surgeon}: {found.voters} movements vote for {found.voted}",
-        f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%} "
-        f"({low:.0%} to {high:.0%}), by chance {found.votes.chance:.0%}",
+        f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {percent(found.votes.accuracy)}% "
+        f"({percent(low)}% to {percent(high)}%), by chance {percent(found.votes.chance)}%",
         *_recognition(found.recognition, found.no_recognition_because),
     )
 
@@ -174,11 +183,13 @@ def _choose_part(client: "Client", path: Path, proposal: int | None, options: Sc
 
 
 def _show_score(scored: "Score") -> None:
+    from skills.fields import percent
+
     beside = [one for one in scored.percentiles if one.below]
     rows = []
     for one in scored.figures:
         below = [level.below.get(one.name) if level.below else None for level in beside]
-        shares = ["" if share is None else f"{100 * share:.0f} %" for share in below]
+        shares = ["" if share is None else f"{percent(share)} %" for share in below]
         numbers = ["" if n is None else f"{n:.2f}" for n in (one.value, one.reference, one.ratio)]
         rows.append((one.label, *numbers, one.unit, *shares))
     show_cells(("", "value", "reference", "ratio", "", *(f"below {one.level}" for one in beside)), rows)

@@ -280,6 +280,10 @@ def verify(
     if limit is not None and not relearn:
         raise BadInput("--limit is about --relearn.", "Add --relearn, or leave out --limit.")
     if bag is not None:
+        if decode_all or head is not None or relearn:
+            raise BadInput(
+                "--decode-all, --head and --relearn are about the installation, not about a bag.", "Leave out the bag."
+            )
         from skills.formats.verify import verify_bag
 
         with bag.open("rb") as file:

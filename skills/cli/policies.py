@@ -250,8 +250,11 @@ def policy_pose_style(surgeon: Surgeon, suture: Suture) -> Answer:
 
 def _share(coverage: "Coverage") -> str:
     """Describe how much of the demonstration a version follows from its starts."""
+    from skills.fields import percent
+
     return (
-        f"{coverage.mean_share:.0%} of the demonstration from a start on average, median {coverage.median_share:.0%}; "
+        f"{percent(coverage.mean_share)}% of the demonstration from a start on average, median "
+        f"{percent(coverage.median_share)}%; "
         f"{coverage.starts_goal_alone} of {coverage.n_states} starts see the goal alone"
     )
 

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from skills.schemas.demos import Proposal
     from skills.schemas.recordings import Recording, RecordingPreview, StatedIn
 
+REFUSES = (413, 415, 422)  # the status codes that are about a recording
+
 commands = typer.Typer()
 recordings = typer.Typer(no_args_is_help=True, help="Raw recordings.")
 proposals = typer.Typer(no_args_is_help=True, help="Proposed hand-offs: to be accepted, corrected or rejected.")
@@ -248,6 +250,7 @@ def _recordings_in(folder: Path) -> Iterator[Path]:
 
 def _rows(client: "Client", path: Path, name: str, stated: "StatedIn") -> Iterator[_Row]:
     """Yield the row of a recording, or one for each episode of a dataset."""
+    from skills.client import Problem
     from skills.formats.lerobot.cut import choose_episodes, find_dataset
 
     words = " ".join(f"`{word}`" for word in _words(stated))
@@ -262,6 +265,8 @@ def _rows(client: "Client", path: Path, name: str, stated: "StatedIn") -> Iterat
         try:
             seen = _preview(client, path, stated, episode or stated.episode)
         except SkillsError as error:
+            if not (isinstance(error, BadInput) or (isinstance(error, Problem) and error.status in REFUSES)):
+                raise  # it says nothing about the recording
             yield _Row(label, stated.source, words, path.suffix[1:], refused=first_sentence(error))
         else:
             samples = dict.fromkeys(str(motion.samples) for motion in seen.motions)

@@ -107,15 +107,15 @@ class History:
             self._why = (refused.message, *refused.remedies)
             raise
 
-    def saved_heads(self, origin: str) -> list[Note]:
-        """Return all saved heads of one log.
+    def saved_heads(self) -> list[Note]:
+        """Return all saved heads, of whichever log.
 
         Raises:
             Corrupt: The file has anything else.
         """
         if not self.heads_file.exists():
             return []
-        return [note for note in read_notes(self.heads_file.read_text()) if note.checkpoint.origin == origin]
+        return read_notes(self.heads_file.read_text())
 
     def compare(self, connection: Connection, saved: Note | None) -> None:
         """Compare the database with the signing key and with the head that was saved last; the result is `refused`.

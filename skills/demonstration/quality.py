@@ -33,7 +33,7 @@ from skills.demonstration.movement import (
     spectral_arc_length,
 )
 from skills.demonstration.segments import arrival
-from skills.fields import Count, Fraction, Point, schema
+from skills.fields import Count, Fraction, Point, percent, schema
 from skills.quaternions import INVERSE, angle_of, multiplied, unit
 
 IDLE_MM_S = 1.0
@@ -203,7 +203,7 @@ def _advice(report: MotionReport, *, has_jaw: bool) -> tuple[str, ...]:
     """Return a sentence for each measure that is out of range."""
     said = []
     if report.idle_share > IDLE_SHARE:
-        said.append(f"The needle rests for {report.idle_share:.0%} of the time: cut away the idle start and end.")
+        said.append(f"The needle rests for {percent(report.idle_share)}% of the time: cut away the idle start and end.")
     if report.clutch_presses > 0:
         times = describe_count(report.clutch_presses)
         said.append(f"You clutched {times}: set up the masters so that the hand-off fits into one sweep.")

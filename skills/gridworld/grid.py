@@ -19,7 +19,7 @@ from skills.arrays import Flags, Floats, Ints, freeze, frozen, xyz
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.quality import describe_count
 from skills.errors import BadPath, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
-from skills.fields import Count, Fraction, Point, schema
+from skills.fields import Count, Fraction, Point, percent, schema
 from skills.gridworld import paper
 
 MOVES = frozen([(a, b, c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)], np.int64, (27, 3), "moves")
@@ -472,7 +472,7 @@ def _calming(
 def _about_the_papers_grid(outside: float, path: GridPath) -> tuple[str, ...]:
     """Return the advice that the samples are not all in the paper's grid."""
     size = " x ".join(f"{count}" for count in path.grid.shape)
-    share = "all" if outside == 1 else f"{outside:.0%}"
+    share = "all" if outside == 1 else f"{percent(outside)}%"
     return (
         f"{share.capitalize()} of the samples are outside the paper's grid "
         f"({' x '.join(str(n) for n in paper.GRID_SHAPE)} cells of {paper.CELL_MM:g} mm), so a grid of {size} was "

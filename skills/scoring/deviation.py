@@ -30,7 +30,7 @@ from skills.arrays import Flags, Floats, interpolated, xyz
 from skills.comparison.distances import PARTS, STATES, TREMOR_S, Difference, difference, own_axes, resampled, shape_of
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip, spans_of
-from skills.fields import Point, schema
+from skills.fields import Point, percent, schema
 from skills.kinematics import quaternion_of
 from skills.learning.evaluation import dtw
 from skills.quaternions import INVERSE, angle_of, mean_rotation, multiplied, unit
@@ -174,7 +174,7 @@ def _places(found: Difference, sides: Sides) -> Iterator[str]:
             how = f"{typical:.1f} mm {ahead if offset > 0 else behind} on average"
         else:
             how = f"{typical:.1f} mm off on average, partly {behind}, partly {ahead}"
-        yield f"In the {PARTS[part]} it is {how}: {100 * shares[part, axis]:.0f} % of the deviation."
+        yield f"In the {PARTS[part]} it is {how}: {percent(shares[part, axis])} % of the deviation."
 
 
 def _thirds(values: Floats) -> Thirds:

@@ -15,7 +15,7 @@ import numpy as np
 
 from skills.arrays import Floats
 from skills.errors import BadInput
-from skills.fields import Fraction, Sha256, schema
+from skills.fields import Fraction, Sha256, percent, schema
 from skills.scoring.calibration import LEAST_RATING, LEVELS, MOST_RATING, PARTS, SkillModel
 from skills.scoring.features import SIDES, TRIAL_KIND_OF, FigureKind, TrialFigures
 from skills.scoring.validation import TaskValidation, known_parts, level_refusals
@@ -125,7 +125,7 @@ def rate(model: SkillModel, name: str, trial: TrialFigures, calibration: str, ju
         level = LEVELS[said]
         words.append(
             f"Nearest is the mean rating of the level {level}: of the trials that it rated so without their surgeon, "
-            f"{100 * levels[level]:.0f} % were of that level."
+            f"{percent(levels[level])} % were of that level."
         )
     if outside:
         words.append(

@@ -21,6 +21,7 @@ import numpy as np
 from skills.arithmetic import wilson
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput
+from skills.fields import percent
 from skills.scoring.calibration import (
     PARTS,
     Cohort,
@@ -390,8 +391,8 @@ def level_refusals(judged: TaskValidation) -> list[str]:
         why.append(f"Random levels are right as often ({_describe_p(right_p, judged.chance)}).")
     if not (right > commonest and right > by_duration):
         why.append(
-            f"It is right about the level in {100 * right:.0f} % of the trials, the most frequent level in "
-            f"{100 * commonest:.0f} %, the duration alone in {100 * by_duration:.0f} %."
+            f"It is right about the level in {percent(right)} % of the trials, the most frequent level in "
+            f"{percent(commonest)} %, the duration alone in {percent(by_duration)} %."
         )
     return why
 

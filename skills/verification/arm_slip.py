@@ -20,7 +20,7 @@ import numpy as np
 from skills.arithmetic import wilson
 from skills.arrays import Floats
 from skills.errors import BadInput, BadSettings
-from skills.fields import Count, Fraction, schema
+from skills.fields import Count, Fraction, percent, schema
 from skills.gridworld.slip import slip_of_elsewhere
 from skills.verification.arm_calibration import MeasuredArm, effective_number, encoder_errors_mm, tracked_errors_mm
 
@@ -88,7 +88,8 @@ def measure_slip(measured: MeasuredArm, cell_mm: float) -> MeasuredSlip:
     slip = slip_of_elsewhere(elsewhere)
     if not slip <= MOST_SLIP:
         raise BadInput(
-            f"In cells of {cell_mm:g} mm the arm was in another cell than it was sent to at {elsewhere:.0%} of the "
+            f"In cells of {cell_mm:g} mm the arm was in another cell than it was sent to at "
+            f"{percent(elsewhere)}% of the "
             "samples; such cells cannot be commanded. Measure larger ones.",
             cell_mm=cell_mm,
             elsewhere=elsewhere,

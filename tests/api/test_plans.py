@@ -38,6 +38,17 @@ def test_every_pass_ends_on_its_suture_point(still: Service):
     assert still.client.plan_of(made["id"]) == made
 
 
+def test_the_form_names_what_it_cannot_keep_of_a_scene(still: Service):
+    plane = {"at_mm": [0.0, 0.0, -175.0], "normal": [0.0, 0.0, 1.0], "along": [1.0, 0.0, 0.0]}
+    box = {"low_mm": [58.0, 58.0, -122.0], "high_mm": [62.0, 62.0, -118.0]}
+    for scene, named in (({"tissue": plane}, None), ({"tissue": plane, "boxes": [box]}, "1 boxes."), (None, None)):
+        made = plan(still, POINTS[0], **({} if scene is None else {"scene": {"frame": "PSM_base"} | scene}))
+        page = still.http.get(f"/pages/plans/new?like={made['id']}", headers={"Accept": "text/html"}).text
+        assert ("a scene that this form cannot show" in page) == (named is not None)
+        assert named is None or named in page
+        assert ('name="tissue_mm" step="any" placeholder="not given" value="-175.0"' in page) == (scene is not None)
+
+
 def test_plans_are_listed_the_newest_first_with_their_newest_playback(trained: Service):
     made = [plan(trained, point, rate_hz=100) for point in POINTS[:2]]
     listed = trained.client.plans()

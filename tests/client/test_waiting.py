@@ -187,6 +187,13 @@ def test_a_service_that_is_started_anew_meanwhile_is_waited_for(made):
 
 
 @pytest.mark.parametrize("made", BOTH)
+def test_a_service_that_stays_away_is_not_said_to_work_on(made):
+    script = Script(answer(RUNNING), *[httpx.ConnectError("refused")] * 2000)
+    with pytest.raises(NotReached):
+        made(script, Time())("wait", ID, timeout_s=5.0)
+
+
+@pytest.mark.parametrize("made", BOTH)
 def test_a_job_that_there_is_not_is_no_reason_to_wait(made):
     for refused, error in ((refusal(404), Problem), (httpx.ConnectError("refused"), NotReached)):
         with pytest.raises(error):

@@ -24,7 +24,7 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.db.tiles import TILES, stored_tiles
 from skills.errors import BadSettings, Corrupt, NotReady
-from skills.library.operation import locks, sweep
+from skills.library.operation import history, locks, sweep
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.history import Verified, edited_rows, sign_history, verify_history
 from skills.library.operation.inspection import inspect_installation
@@ -39,7 +39,7 @@ from skills.library.recordings.recordings import stored_recording
 from skills.schemas.people import SurgeonIn
 from skills.settings import Settings
 from skills.transparency.merkle import Checkpoint, Tree, inclusion_proof, leaf_hash, node_from
-from skills.transparency.notes import read_notes
+from skills.transparency.notes import Note, read_notes
 from skills.transparency.signing_keys import SigningKey
 from tests import backends
 from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
@@ -84,6 +84,20 @@ def test_the_triggers_note_every_logged_table(full: Database):
     with full.reading() as session:
         names = {*session.scalars(text(query))}
     assert names == {f"{table}_noted_{change}" for table in logged() for change in ("add", "change", "remove")}
+
+
+def test_what_is_signed_while_it_is_verified_is_no_fault(full: Database, monkeypatch: pytest.MonkeyPatch):
+    read = history._checkpoints
+
+    def read_and_sign(connection: Connection) -> Iterator[tuple[int, int, Note | None]]:
+        yield from read(connection)
+        with full.writing() as session:
+            put_surgeon(session, f"late-{full.engine.dialect.name}", SurgeonIn(), "test")
+        assert sign_history(full) is not None
+
+    monkeypatch.setattr(history, "_checkpoints", read_and_sign)
+    with full.reading() as session:
+        assert list(verify_history(session.connection(), full.history, None, Verified())) == []
 
 
 def test_what_the_service_wrote_is_whole_and_signed(full: Database):

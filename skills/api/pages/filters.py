@@ -9,6 +9,7 @@ from typing import Any
 from skills.arrays import Floats
 from skills.db.models import Surgeon, SutureType
 from skills.db.service_tables import Job
+from skills.fields import percent
 from skills.library.operation.styles import StyleState
 from skills.library.plans.headline import describe_error
 from skills.schemas.people import SurgeonIn, SutureTypeIn
@@ -66,13 +67,8 @@ def size(count: int) -> str:
 
 
 def share(value: float | None, digits: int = 1) -> str:
-    """Return a fraction as percent; less than all is never rounded to 100 %."""
-    if value is None:
-        return MISSING
-    text = f"{100 * value:.{digits}f}"
-    if value < 1 and float(text) >= 100:
-        return f"> {100 - 10**-digits:.{digits}f} %"
-    return f"{text} %"
+    """Return a fraction as percent."""
+    return MISSING if value is None else f"{percent(value, digits)} %"
 
 
 def outline(style: StyleState) -> dict[str, object] | None:

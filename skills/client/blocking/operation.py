@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from datetime import datetime
 from typing import TYPE_CHECKING, Literal
 
@@ -60,6 +60,7 @@ class Operation(Connection):
         Raises:
             JobTakesLonger: It has not ended in time.
             JobFailed: It failed or was cancelled.
+            NotReached: At the end of that time the service did not answer.
         """
         deadline_s = self._clock() + timeout_s
         last: Job | None = None
@@ -78,10 +79,12 @@ class Operation(Connection):
     def _states(self, job: str, deadline_s: float) -> Generator[Job, None, None]:
         """Yield the state of a job now, and again whenever it may have changed, until the deadline."""
         yield self.job(job)
-        streams, pause_s = self._streams, PAUSES_S[0]
+        streams, pause_s, down = self._streams, PAUSES_S[0], None
         while True:
             left_s = deadline_s - self._clock()
             if left_s <= 0:
+                if down is not None:
+                    raise down
                 return
             if streams:
                 try:
@@ -94,8 +97,12 @@ class Operation(Connection):
                     streams = False
             self._sleep(min(pause_s, max(0.0, deadline_s - self._clock())))
             pause_s = min(PAUSES_S[1], pause_s * 1.3)
-            with suppress(NotReached):  # the service answered before, so it is restarting, and the job goes on
-                yield self.job(job)
+            try:
+                seen, down = self.job(job), None
+            except NotReached as error:  # it answered before, so it is restarting, and the job goes on
+                down = error
+            else:
+                yield seen
 
     def _events(self, job: str, left_s: float) -> Generator[Job, None, None]:
         """Yield the job of each server-sent event, until the stream or the time ends."""

@@ -21,6 +21,7 @@ from skills.comparison import distances
 from skills.db.models import Demonstration, SutureType
 from skills.db.session import Database
 from skills.errors import BadPath, Conflict, NotFound
+from skills.fields import percent
 from skills.library.comparison.measuring import far_apart
 from skills.library.comparison.members import Member, comparable_demo, members_of, sessions_of, without_overlaps
 from skills.library.comparison.recognition import Recognised, recognise_arms, recognise_demo, recognitions, votes
@@ -317,7 +318,7 @@ def _apart(compared: _Compared, one: int, other: int, of_one: int, of_other: int
 def _sentence(found: distances.Difference, names: tuple[str, str], scaled: bool) -> str:
     """Return the sentence on the part of the path and the axis with the largest difference."""
     (part, axis), (share, net, size) = found.where, found.most
-    there = f"{share:.0%} of their difference is there, {axis}."
+    there = f"{percent(share)}% of their difference is there, {axis}."
     if found.direction is None:
         by = _length(size, scaled)
         return f"In the {part}, the paths of {names[0]} and {names[1]} are {by} apart, in both directions; {there}"

@@ -196,7 +196,7 @@ def verify_history(
     """Verify the history and every logged row, in one consistent state.
 
     Args:
-        connection: In a transaction that reads one state.
+        connection: In a transaction that reads one state, and has read nothing yet.
         history: The history, with its key.
         heads: Checkpoints that were kept elsewhere; the history must continue each of them. None: those of its file.
         done: Empty; it counts what was compared.
@@ -204,6 +204,8 @@ def verify_history(
     Yields:
         Findings: what is wrong, and why.
     """
+    # before the first query: what others sign from now on is not in the state that is read
+    saved = history.saved_heads() if heads is None else []
     origin = history.origin(connection)
     if origin is None:
         yield "history", "none was begun; run `skills migrate`"
@@ -226,7 +228,7 @@ def verify_history(
             yield name, "it is not signed with the key of this installation"
     if since is None:
         yield "history", "no checkpoint is signed with the key of this installation"
-    for note in history.saved_heads(origin) if heads is None else heads:
+    for note in [one for one in saved if one.checkpoint.origin == origin] if heads is None else heads:
         name = f"head of {note.checkpoint.size} leaves"
         if note.checkpoint.origin != origin:
             yield name, f"it is of the history {note.checkpoint.origin}, and this one is {origin}"

@@ -29,6 +29,7 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.segments import Segment
 from skills.errors import BadSettings, Conflict, DatabaseBusy, SkillsError
+from skills.fields import percent
 from skills.formats.parsed import ParsedContent
 from skills.gridworld import paper
 from skills.gridworld.grid import PathReport, choose_grid, describe_path, discretize
@@ -350,7 +351,7 @@ def _certified(version: PolicyVersion, others: Sequence[Choice]) -> TryStep:
     text = (
         f"{optimal} of {certificate.states_checked} actions are {OPTIMAL}, {coverage.starts_reaching_goal} of "
         f"{coverage.n_states} starts reach the goal, and each within {near.radius_mm:g} mm of the demonstrated "
-        f"one follows at least {near.share:.0%} of the demonstration (limit {near.least_share:.0%})."
+        f"one follows at least {percent(near.share)}% of the demonstration (limit {percent(near.least_share)}%)."
     )
     reasons = certificate.refused_because
     if not reasons:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan
+from skills.fields import percent
 from skills.kinematics import instrument_of
 from skills.learning.certificate import Certificate, NearLimits, NearOdds, NearStarts, OddsLimits, least_gamma
 from skills.learning.dynamic_programming import FAINT
@@ -108,7 +109,7 @@ def _unlikely(odds: NearOdds) -> Iterator[tuple[RefusalKind, str]]:
             "scene odds",
             f"of {odds.starts} starts near the demonstrated one, one finishes with a probability of "
             f"{odds.finishing:.1%}, and one touches the scene with {odds.touching:.1%}; the gate requires at least "
-            f"{odds.least_finishing:.0%} and at most {odds.most_touching:.0%}",
+            f"{percent(odds.least_finishing)}% and at most {percent(odds.most_touching)}%",
         )
 
 
@@ -120,7 +121,8 @@ def _not_the_style(policy: Policy, certificate: Certificate, near: NearStarts) -
         yield (
             "near starts",
             f"of {near.starts} starts within {near.radius_mm:g} mm of the demonstrated one, one follows only "
-            f"{near.share:.0%} of the demonstration, and the gate requires {near.least_share:.0%}; train with a "
+            f"{percent(near.share)}% of the demonstration, and the gate requires {percent(near.least_share)}%; "
+            "train with a "
             f"joining rule such as --join {max(near.least_share, 0.5):g}, which leads them back to an earlier part",
         )
 
@@ -131,8 +133,10 @@ def pose_refusals(poses: CertifiedPoses | None, near: NearLimits) -> list[GateRe
     if share >= near.least_share:
         return []
     text = (
-        f"of the starts within {near.radius_mm:g} mm of the pose style's first pose, one joins it where {share:.0%} is "
-        f"left, and the gate requires {near.least_share:.0%}; train phase-q-learning or value-iteration with a joining "
+        f"of the starts within {near.radius_mm:g} mm of the pose style's first pose, one joins it where "
+        f"{percent(share)}% is "
+        f"left, and the gate requires {percent(near.least_share)}%; train phase-q-learning or value-iteration "
+        "with a joining "
         f"rule such as --join {max(near.least_share, 0.5):g}"
     )
     return [GateRefusal("near starts", text)]

@@ -6,6 +6,7 @@ from skills.db.models import Demonstration
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.quality import describe
 from skills.demonstration.recording import equal_samples
+from skills.fields import percent
 from skills.gridworld.grid import PAPER_GRID, GridPath, describe_path
 from skills.schemas.demos import DemoReport
 from skills.schemas.grids import ChosenGrid
@@ -59,6 +60,7 @@ def _about_equal(count: int, samples: int) -> list[str]:
     if count <= EQUAL_SHARE * samples:
         return []
     return [
-        f"{count} of {samples} samples ({count / samples:.0%}) repeat the pose of the sample before: the recorder was "
+        f"{count} of {samples} samples ({percent(count / samples)}%) repeat the pose of the sample before: the "
+        "recorder was "
         "faster than its source, so speeds are less certain than the rate suggests."
     ]
