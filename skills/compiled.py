@@ -90,6 +90,11 @@ def cache_folders() -> set[Path | None]:
     return {loop.cache_folder for loop in LOOPS}
 
 
+def is_cached() -> bool:
+    """Return whether machine code of an imported loop is in a cache folder."""
+    return any(any(folder.glob("*.nbi")) for folder in cache_folders() if folder is not None)
+
+
 def check_cache_folder(folder: Path | None) -> None:
     """Refuse a cache folder to which others can write, and one that is not inside NUMBA_CACHE_DIR if that is set.
 

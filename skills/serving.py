@@ -40,7 +40,7 @@ from skills.api.app import create_app, prepare_database, prepare_to_serve
 from skills.api.rate_limits import Bucket
 from skills.api.sessions import FLOODED, MESSAGE_BYTES
 from skills.client import Client
-from skills.compiled import check_cache_setting
+from skills.compiled import check_cache_setting, is_cached
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
 from skills.formats.reader_process import READY, get_ready
@@ -278,6 +278,8 @@ def begin(given: int) -> None:
     Args:
         given: A file with the environment and the arguments of the command, as JSON, which is read last.
     """
+    if not is_cached():
+        print("The loops are compiled for this machine, once: some ten seconds.", flush=True)
     get_ready()
     warm_up(learn_once).join()
     fork_ahead(READY)

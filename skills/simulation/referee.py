@@ -60,7 +60,7 @@ from skills.verification.clearance import (
     psm_m_poses,
 )
 from skills.verification.error_draws import Displaced, Drawn, draw
-from skills.verification.monte_carlo import at_hand_off, caught_by, scene_of
+from skills.verification.monte_carlo import at_hand_off, caught_by, crossed, scene_of
 from skills.verification.probabilities import EstimateSettings, Probability, share
 
 TRIALS = "skills.simulation.referee:trials"
@@ -343,7 +343,7 @@ def _closed_form(
     scene = scene_of(trajectory, number, -np.inf, conditions.opening_rad)
     arms = at_hand_off(scene, None, conditions.unknown_depth_mm)
     assert arms is not None
-    return np.asarray(np.logical_and(*caught_by(arms, drawn.shift_mm, displaced, drawn.turned, conditions)))
+    return np.asarray(np.logical_and(*caught_by(crossed(arms, drawn.shift_mm, displaced, drawn.turned), conditions)))
 
 
 def _request(

@@ -35,7 +35,8 @@ All of this is ours.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import cos, pi, sin
+from math import cos, pi, radians, sin
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -407,18 +408,29 @@ class HandOff:
     jaw_m: Floats
 
 
-def catch(planned: HandOff, turned: Floats, apart_mm: Floats, opening_rad: float) -> tuple[Flags, Floats]:
+class Crossing(NamedTuple):
+    """Where the needle crosses the plane in which PSM_M's fingers close, each of shape (N,); NaN where it does not.
+
+    Attributes:
+        beside_mm: From the middle of the jaws towards a finger.
+        deep_mm: From their hinge along the approach.
+        along_rad: Along the needle from PSM_A's grip to the crossing.
+        askew_rad: Angle between the needle's tangent there and the hinge.
+    """
+
+    beside_mm: Floats
+    deep_mm: Floats
+    along_rad: Floats
+    askew_rad: Floats
+
+
+def crossing(planned: HandOff, turned: Floats, apart_mm: Floats) -> Crossing:
     """Compute the place and the direction of the needle in PSM_M's open jaws.
 
     Args:
         planned: The hand-off. The needle stands across PSM_A's jaws, its free end against PSM_M's approach.
         turned: Rotation of the needle about the grip, in the same frame, shape (N, 3, 3).
         apart_mm: Error of PSM_A's position relative to PSM_M's, in the same frame, shape (N, 3).
-        opening_rad: Opening of each of PSM_M's fingers.
-
-    Returns:
-        Whether the needle is between the fingers, with needle to spare on both sides of them, shape (N,), and the angle
-        between its tangent there and their hinge, rad, shape (N,); NaN if it does not cross their plane.
     """
     n, a = planned.jaw_a[:, 0], planned.jaw_a[:, 2]
     free = n if n @ planned.jaw_m[:, 2] < 0 else -n
@@ -434,13 +446,44 @@ def catch(planned: HandOff, turned: Floats, apart_mm: Floats, opening_rad: float
     phi = np.where(crosses, np.arccos(np.where(crosses, level, 0.0)), np.nan) - np.arctan2(u[:, 0], t[:, 0])
     sine, cosine = np.sin(phi)[:, None], np.cos(phi)[:, None]
     at, along = grip + NEEDLE_RADIUS_MM * (t * (1 - cosine) + u * sine), t * sine + u * cosine
-    to_spare = (phi >= _HALF_WIDTH_RAD) & (phi <= NEEDLE_FREE_RAD - _HALF_WIDTH_RAD)
-    return to_spare & _swept(at[:, 1], at[:, 2], opening_rad), np.arccos(np.clip(np.abs(along[:, 0]), 0.0, 1.0))
+    return Crossing(at[:, 1], at[:, 2], phi, np.arccos(np.clip(np.abs(along[:, 0]), 0.0, 1.0)))
 
 
-def _swept(y_mm: Floats, z_mm: Floats, opening_rad: float) -> Flags:
-    """Return whether a needle that crosses the jaws' plane there lies entirely in the fingers' sector; NaN does not."""
+@dataclass(frozen=True)
+class Grasp:
+    """What a needle that crosses the jaws' plane needs to be taken; NaN never is.
+
+    Attributes:
+        spare_rad: Arc to spare on either side of the crossing; below 0 the crossing may be beyond an end.
+        least_mm: Least distance of its middle from the hinge.
+        most_mm: Greatest distance of its middle from the hinge.
+        opening_rad: Half of the sector that the fingers sweep; all of the needle's thickness lies within.
+        askew_rad: Greatest angle to the hinge.
+    """
+
+    spare_rad: float
+    least_mm: float
+    most_mm: float
+    opening_rad: float
+    askew_rad: float = pi / 2
+
+    def takes(self, at: Crossing) -> Flags:
+        """Return whether each needle is taken, shape (N,)."""
+        to_spare = (at.along_rad >= self.spare_rad) & (at.along_rad <= NEEDLE_FREE_RAD - self.spare_rad)
+        depth = np.hypot(at.beside_mm, at.deep_mm)
+        within = (depth >= self.least_mm) & (depth <= self.most_mm) & (at.askew_rad <= self.askew_rad)
+        sine, cosine = sin(self.opening_rad), cos(self.opening_rad)
+        swept = np.abs(at.beside_mm) * cosine + NEEDLE_THICK_MM / 2 <= at.deep_mm * sine
+        return np.asarray(to_spare & within & swept)
+
+
+def caught(opening_rad: float) -> Grasp:
+    """Return the grasp of a needle whole between fingers of an opening, with needle to spare on both sides."""
     half = NEEDLE_THICK_MM / 2
-    depth = np.hypot(y_mm, z_mm)
-    within = (depth >= WRIST_RADIUS_MM + half) & (depth <= JAW_TIP_MM - half)
-    return np.asarray(within & (np.abs(y_mm) * cos(opening_rad) + half <= z_mm * sin(opening_rad)))
+    return Grasp(_HALF_WIDTH_RAD, WRIST_RADIUS_MM + half, JAW_TIP_MM - half, opening_rad)
+
+
+# By friction, in `docs/contact.md`: whatever the fingers touch is taken, between the hinge and their ends and on all of
+# their width. The three angles are fitted there, and tested on other plans. None of this is a gate.
+_TOUCHED = (-_HALF_WIDTH_RAD, 0.0, JAW_TIP_MM + NEEDLE_THICK_MM / 2, radians(45.0))
+GRASPS = {"held": Grasp(*_TOUCHED, radians(40.0)), "straight": Grasp(*_TOUCHED, radians(16.0))}

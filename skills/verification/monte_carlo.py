@@ -411,7 +411,7 @@ def estimate_success(
     sizes = {"suture_point_mm": varied.suture_point_mm, "needle_rad": varied.needle_rad}
     draws = [draw(seed, k, varied.variations, len(scene.phase), **sizes) for k, scene in enumerate(thin)]
     without = [errors.without(size) for size in spared]
-    faults, succeeds = zip(
+    faults, succeeds, taken = zip(
         *(_judged(*one, approach_m, under, without, varied, allowed) for one in zip(thin, draws, strict=True)),
         strict=True,
     )
@@ -428,16 +428,18 @@ def estimate_success(
         with_psm_m=trajectory.psm_m is not None,
         hand_offs=sum("place" in one for one in faults),
         looked_at=tuple(len(scene.phase) for scene in thin),
-        under=tuple(
-            counted([{name: one[k] for name, one in each.items()} for each in faults], one)
-            for k, one in enumerate(under)
-        ),
+        under=tuple(counted(_of(faults, k), _of(taken, k), one) for k, one in enumerate(under)),
         settings=varied,
         limits=allowed,
         costs=tuple(sorted(costs, key=lambda one: -one.without.count)),
         version=JUDGE_VERSION,
         pad_normal=pad_normal,
     )
+
+
+def _of(passes: Sequence[dict[str, Flags]], k: int) -> list[dict[str, Flags]]:
+    """Return what was found of each pass under the k-th errors."""
+    return [{name: found[k] for name, found in each.items()} for each in passes]
 
 
 # ---- one pass --------------------------------------------------------------------------------------------------
@@ -451,12 +453,13 @@ def _judged(
     spared: Sequence[ArmErrors],
     varied: EstimateSettings,
     limits: Limits,
-) -> tuple[dict[str, Flags], Flags]:
+) -> tuple[dict[str, Flags], Flags, dict[str, Flags]]:
     """Judge a pass in N variations under some errors, and whether it succeeds under the `spared` ones.
 
     Returns:
-        For each judged fault whether it occurs under each of E errors, shape (E, N); and the success without one size
-        of the stated errors each, and last with a needle that stands as planned, shape (C, N).
+        For each judged fault whether it occurs under each of E errors, shape (E, N); the success without one size
+        of the stated errors each, and last with a needle that stands as planned, shape (C, N); and, where there is a
+        hand-off, whether friction would take the needle in each of `clearance.GRASPS`, shape (E, N).
     """
     displaced = [drawn.under(one, scene.stamps_s) for one in [*under, *spared]]
     arms = at_hand_off(scene, approach_m, varied.unknown_depth_mm)
@@ -466,10 +469,14 @@ def _judged(
     if scene.pad_top_mm > -inf:
         missed["needle"] = in_tissue(scene, displaced, drawn.turned)
         (upright,) = in_tissue(scene, displaced[:1], unturned)
+    taken: dict[str, Flags] = {}
     if arms is not None:
-        caught = [caught_by(arms, drawn.shift_mm, one, drawn.turned, varied) for one in displaced]
+        crossings = [crossed(arms, drawn.shift_mm, one, drawn.turned) for one in displaced]
+        caught = [caught_by(one, varied) for one in crossings]
         missed |= {name: ~np.array(one) for name, one in zip(AT_THE_END, zip(*caught, strict=True), strict=True)}
-        upright |= ~np.logical_and(*caught_by(arms, drawn.shift_mm, displaced[0], unturned, varied))
+        upright |= ~np.logical_and(*caught_by(crossed(arms, drawn.shift_mm, displaced[0], unturned), varied))
+        for name, grasp in clearance.GRASPS.items():
+            taken[name] = np.array([grasp.takes(one) for one in crossings[: len(under)]])
     lost = np.logical_or.reduce([np.zeros((len(displaced), len(upright)), dtype=bool), *missed.values()])
     wanted = ~lost
     wanted[: len(under)] = True  # of these every fault is counted; of the others success alone
@@ -477,7 +484,7 @@ def _judged(
     spoilt = np.logical_or.reduce(list(found.values()))
     good = ~(lost | spoilt)[len(under) :]
     faults = {name: one[: len(under)] for name, one in (found | missed).items()}
-    return faults, np.concatenate([good, ~(upright | spoilt[0])[None]])
+    return faults, np.concatenate([good, ~(upright | spoilt[0])[None]]), taken
 
 
 def in_tissue(scene: PlannedPass, displaced: Sequence[Displaced], turned: Floats) -> Flags:
@@ -553,19 +560,16 @@ def at_hand_off(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: floa
     )
 
 
-def caught_by(
-    arms: tuple[Planned, Planned], shift_mm: Floats, errors: Displaced, turned: Floats, varied: EstimateSettings
-) -> tuple[Flags, Flags]:
-    """Return whether the needle is between PSM_M's fingers, and at a right angle, each of shape (N,).
+def crossed(arms: tuple[Planned, Planned], shift_mm: Floats, errors: Displaced, turned: Floats) -> clearance.Crossing:
+    """Return where the needle crosses PSM_M's jaws in N variations.
 
     Args:
         arms: Both arms at the hand-off, as `at_hand_off` returns them.
         shift_mm: Shift of the pass in each variation, shape (N, 3).
         errors: The displacements; the last of their samples counts.
         turned: Rotation of the needle about PSM_A's grip, shape (N, 3, 3).
-        varied: The conditions of a catch.
 
-    `catch` has PSM_M's jaws as planned, so PSM_A is taken to where it is relative to them.
+    `clearance.crossing` has PSM_M's jaws as planned, so PSM_A is taken to where it is relative to them.
     """
     (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses_of(arm.joints) for arm in arms)
     planned = clearance.HandOff(tip_a[0], jaw_a[0], tip_m[0], jaw_m[0])
@@ -576,5 +580,9 @@ def caught_by(
     askew = jaw_a @ planned.jaw_a.T
     grip = tip_a + errors.tip_mm[0, :, -1] + HELD_MM * jaw_a[:, :, 2] - tip_m - errors.tip_mm[1, :, -1]
     apart = np.einsum("nij,nj->ni", back, grip) - (planned.tip_a + HELD_MM * planned.jaw_a[:, 2] - planned.tip_m)
-    place, angle = clearance.catch(planned, back @ askew @ turned, apart, varied.opening_rad)
-    return place, angle <= varied.stated_rad
+    return clearance.crossing(planned, back @ askew @ turned, apart)
+
+
+def caught_by(at: clearance.Crossing, varied: EstimateSettings) -> tuple[Flags, Flags]:
+    """Return whether the needle is between PSM_M's fingers, and at a right angle, each of shape (N,)."""
+    return clearance.caught(varied.opening_rad).takes(at), at.askew_rad <= varied.stated_rad

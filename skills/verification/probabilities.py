@@ -15,6 +15,7 @@ from skills.errors import BadSettings
 from skills.fields import Count, Figure, Fraction, Point, schema
 from skills.planning.handoff import OPEN_RAD
 from skills.verification.arm_errors import ArmErrors
+from skills.verification.clearance import GRASPS
 from skills.verification.gates import Limits
 
 JUDGE_VERSION = 1  # raise it when the same plan would be judged otherwise
@@ -99,11 +100,22 @@ class Faults:
 @schema
 @dataclass(frozen=True)
 class PassEstimate:
-    """A pass under some errors: it succeeds if it is clear and, if there is a hand-off, the needle is caught."""
+    """A pass under some errors: it succeeds if it is clear and, if there is a hand-off, the needle is caught.
+
+    Attributes:
+        succeeds: Clear and caught.
+        clear: Without a fault on the way.
+        caught: The needle whole between PSM_M's fingers, and nearly along their hinge; None: no hand-off.
+        held: The needle held by PSM_M in whatever way, as friction decides it in simulation; of the hand-over alone.
+        straight: Held nearly along the hinge; the same.
+        faults: The faults.
+    """
 
     succeeds: Probability
     clear: Probability
     caught: Probability | None
+    held: Probability | None
+    straight: Probability | None
     faults: Faults
 
 
@@ -114,11 +126,15 @@ class EstimateUnder:
 
     Attributes:
         plan: The whole plan.
+        held: The needle is held by PSM_M in every pass, see `PassEstimate`; None where a pass has no hand-off.
+        straight: It is held straight in every pass.
         passes: Each pass.
         errors: The errors.
     """
 
     plan: Probability
+    held: Probability | None
+    straight: Probability | None
     passes: tuple[PassEstimate, ...]
     errors: ArmErrors
 
@@ -169,24 +185,28 @@ class SuccessEstimate:
     pad_normal: Point
 
 
-def counted(found: list[dict[str, Flags]], errors: ArmErrors) -> EstimateUnder:
+def counted(found: list[dict[str, Flags]], taken: list[dict[str, Flags]], errors: ArmErrors) -> EstimateUnder:
     """Count the variations of each pass; variation k of a plan succeeds if variation k of all its passes does.
 
     Args:
         found: For each pass and each fault that was judged whether it occurs, shape (N,).
+        taken: For each pass with a hand-off whether the needle is "held", and "straight", shape (N,).
         errors: The errors of the arms.
     """
     wrong = np.any([np.any(list(one.values()), axis=0) for one in found], axis=0)
-    return EstimateUnder(share(wrong), tuple(_pass(one) for one in found), errors)
+    held, straight = (share(~np.all([one[name] for one in taken], axis=0)) if all(taken) else None for name in GRASPS)
+    passes = tuple(_pass(*one) for one in zip(found, taken, strict=True))
+    return EstimateUnder(share(wrong), held, straight, passes, errors)
 
 
-def _pass(found: dict[str, Flags]) -> PassEstimate:
-    """Count the variations of one pass without a fault, and with each fault."""
+def _pass(found: dict[str, Flags], taken: dict[str, Flags]) -> PassEstimate:
+    """Count the variations of one pass without a fault, with each fault, and in which the needle is taken."""
     on_the_way, at_the_end = ([found[name] for name in names if name in found] for names in (ON_THE_WAY, AT_THE_END))
     return PassEstimate(
         succeeds=share(np.any(on_the_way + at_the_end, axis=0)),
         clear=share(np.any(on_the_way, axis=0)),
         caught=share(np.any(at_the_end, axis=0)) if at_the_end else None,
+        **{name: share(~taken[name]) if taken else None for name in GRASPS},
         faults=Faults(**{name: int(np.count_nonzero(wrong)) for name, wrong in found.items()}),
     )
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from skills.compiled import cache_folders, check_cache_folder
+from skills.compiled import cache_folders, check_cache_folder, is_cached
 from skills.errors import BadSettings
 from tests.api.processes import free_port
 from tests.learning.test_kernel_cache import start, told
@@ -73,6 +73,13 @@ def test_a_folder_of_ones_own_is_taken_and_so_is_the_one_beside_the_code(folder)
     check_cache_folder(folder)
     for each in cache_folders():
         check_cache_folder(each)
+
+
+def test_whether_loops_were_compiled_before_is_known_from_their_files(folder, monkeypatch):
+    monkeypatch.setattr("skills.compiled.cache_folders", lambda: {folder, None})
+    assert not is_cached()
+    (folder / "loops.sweep-1.py311.nbi").touch()
+    assert is_cached()
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o775, 0o1777, 0o702], ids=oct)

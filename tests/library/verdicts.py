@@ -32,14 +32,14 @@ def probability(count: int, of: int = 1000, lower: float = 0.5, upper: float = 1
 
 def of_pass(succeeds: Probability | None = None, faults: Faults = WITHOUT_HAND_OFF) -> PassEstimate:
     succeeds = succeeds or probability(990)
-    return PassEstimate(succeeds, succeeds, None, faults)
+    return PassEstimate(succeeds, succeeds, None, None, None, faults)
 
 
 def doubted(
     whole: Probability, *passes: PassEstimate, errors: ArmErrors = UNCALIBRATED, cost: Cost | None = None, **more: Any
 ) -> SuccessEstimate:
     """Return a report on a plan under some errors of the arms."""
-    under = (EstimateUnder(whole, passes, errors),)
+    under = (EstimateUnder(whole, None, None, passes, errors),)
     costs = () if cost is None else (cost,)
     rest = {"settings": EstimateSettings(), "limits": Limits(), "version": JUDGE_VERSION, "pad_normal": UPWARDS} | more
     return SuccessEstimate(0, None, False, 0, (), under, costs=costs, **rest)

@@ -16,6 +16,7 @@ from skills.verification.error_draws import draw, rotation_of
 from skills.verification.probabilities import EstimateSettings
 from tests.arms import ARMS, EXACT
 from tests.needs import need
+from tests.simulation.hand_overs import TESTED, Compared, compare
 from tests.verification.test_monte_carlo import ALONE, BESIDE, PSM_M, motion, only, some_plan
 
 ONE = motion(1, PSM_M)
@@ -263,3 +264,21 @@ def test_half_the_time_step_hardly_changes_an_outcome():
         )
         changed += abs(whole.held.count - half.held.count)
     assert changed <= 2
+
+
+@pytest.mark.nightly  # half an hour
+def test_both_numbers_of_a_hand_over_are_calibrated_on_200_other_plans():
+    need("mujoco")
+    for name, one in compare(TESTED, 200).items():
+        assert one.calibration_error() <= 0.05, name
+        assert one.brier_gain()[0] > 0, name
+
+
+def test_calibration_is_worked_by_hand():
+    said = np.repeat([0.2, 0.8], 50)
+    right, wrong = Compared(said, said), Compared(said, 1 - said)
+    assert (right.calibration_error(), wrong.calibration_error()) == (0.0, pytest.approx(0.6))
+    low, high = right.brier_gain()  # 0.25 of the constant 0.5, less 0.16
+    assert low == pytest.approx(0.09) == high
+    assert wrong.brier_gain()[1] < 0
+    assert [count for count, *_ in Compared(np.linspace(0, 1, 25), np.zeros(25)).bins()] == [3] * 5 + [2] * 5

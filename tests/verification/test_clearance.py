@@ -3,7 +3,7 @@
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from importlib.resources import files
-from math import erf, radians, sqrt
+from math import erf, nan, radians, sqrt
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,17 +23,20 @@ from skills.verification.clearance import (
     FINGER_MM,
     FINGER_RADIUS_MM,
     FINGERS,
+    GRASPS,
     LINKS,
     NEEDLE_FREE_RAD,
     NEEDLE_THICK_MM,
     RADII_MM,
     WRIST_RADIUS_MM,
     Bounds,
+    Crossing,
     HandOff,
     Links,
-    catch,
+    caught,
     clearance_between,
     clearance_to_pad,
+    crossing,
     links_of,
     needle_poses,
     needle_to_pad_mm,
@@ -264,6 +267,16 @@ def planned_hand_off() -> HandOff:
 
 
 PLANNED = planned_hand_off()
+
+
+def catch(
+    planned: HandOff, turned: np.ndarray, apart_mm: np.ndarray, opening_rad: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return whether the needle is caught between fingers, and its angle to their hinge."""
+    at = crossing(planned, turned, apart_mm)
+    return caught(opening_rad).takes(at), at.askew_rad
+
+
 UNTURNED = np.eye(3)[None]
 
 
@@ -313,6 +326,31 @@ def test_along_the_hinge_the_needle_slides_through_until_it_ends():
     # Its free end is 120 degrees from PSM_A's grip: at 4 mm, 119 degrees, it is only half across the fingers.
     assert between.tolist()[:5] == [True, True, True, True, False]
     assert not between[5] and np.isnan(askew[5])  # the offset exceeds the radius: the needle does not pass at all
+
+
+@pytest.mark.parametrize(
+    ("beside_mm", "deep_mm", "along_deg", "askew_deg", "held", "straight"),
+    [
+        (0.0, 7.0, 90.0, 0.0, True, True),  # as planned
+        (0.0, 7.0, 90.0, 30.0, True, False),  # askew: how it is held, and not whether
+        (0.0, 7.0, 90.0, 60.0, False, False),
+        (0.0, 12.0, 90.0, 0.0, False, False),  # 5 mm short: beyond the tips
+        (8.0, 7.0, 90.0, 0.0, False, False),  # beside the fingers
+        (0.0, 1.0, 90.0, 0.0, True, True),  # against the wrist
+        (0.0, 7.0, 126.0, 0.0, True, True),  # its end is beside the fingers' middle, and they are 2.2 mm wide
+        (0.0, 7.0, 129.0, 0.0, False, False),
+        (nan, nan, nan, nan, False, False),
+    ],
+)
+def test_grasps_by_friction_are_worked_by_hand(beside_mm, deep_mm, along_deg, askew_deg, held, straight):
+    at = Crossing(*(np.array([one]) for one in (beside_mm, deep_mm, radians(along_deg), radians(askew_deg))))
+    assert [GRASPS[name].takes(at).tolist() for name in ("held", "straight")] == [[held], [straight]]
+
+
+@given(some.arrays(np.float64, (4, 20), elements=st.floats(-15, 15)))
+def test_what_is_held_straight_is_held(numbers):
+    at = Crossing(*numbers)
+    assert not (GRASPS["straight"].takes(at) & ~GRASPS["held"].takes(at)).any()
 
 
 def test_a_sampled_arc_crosses_the_jaws_at_the_same_place_and_angle():

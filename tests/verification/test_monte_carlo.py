@@ -261,7 +261,7 @@ def test_a_jaw_that_was_not_realigned_hands_nothing_on():
 def caught(scene, displaced: Displaced) -> bool:
     arms = monte_carlo.at_hand_off(scene, APPROACH, 200.0)
     turned = np.broadcast_to(np.eye(3), (4, 3, 3))
-    place, angle = monte_carlo.caught_by(arms, np.zeros((4, 3)), displaced, turned, NO_DOUBT)
+    place, angle = monte_carlo.caught_by(monte_carlo.crossed(arms, np.zeros((4, 3)), displaced, turned), NO_DOUBT)
     assert (place & angle).all() == (place & angle).any()
     return bool((place & angle)[0])
 
@@ -494,7 +494,14 @@ def test_doubts_that_cannot_be_meant_are_refused():
 def test_worlds_are_counted_by_hand():
     """Of four worlds the first fails to reach, the second to place, both in the first pass; the third at the pad."""
     world = np.eye(4, dtype=bool)
-    counted = probabilities.counted([{"reach": world[0], "place": world[1]}, {"pad": world[2]}], EXACT)
+    taken = [{"held": ~world[3], "straight": ~(world[3] | world[0])}, {"held": ~world[0], "straight": ~world[0]}]
+    faults = [{"reach": world[0], "place": world[1]}, {"pad": world[2]}]
+    without = probabilities.counted(faults, [taken[0], {}], EXACT)
+    assert (without.held, without.straight, without.passes[1].held) == (None, None, None)
+    counted = probabilities.counted(faults, taken, EXACT)
+    assert (counted.held and counted.held.count, counted.straight and counted.straight.count) == (2, 2)
+    assert [one.held and one.held.count for one in counted.passes] == [3, 3]
+    assert [one.straight and one.straight.count for one in counted.passes] == [2, 3]
     first, second = counted.passes
     assert (counted.plan.count, counted.plan.of, counted.plan.probability) == (1, 4, 0.25)
     assert (first.succeeds.count, first.clear.count, first.caught and first.caught.count) == (2, 3, 3)

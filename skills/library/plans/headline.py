@@ -81,12 +81,14 @@ def _estimated(plan: PlanDescription, report: Verdict, errors: ArmErrors) -> _Es
         return _Estimated(unjudged=unjudged.words())
     counts, left_out = counted_as(stated), not_judged(plan, stated)
     whole = stated.plan
-    estimate = (
-        f"with {describe_errors(stated.errors.name)} {EVENTS[counts]} in {whole.count} of {whole.of} worlds: "
-        f"{_percent(whole.probability)} ({_percent(whole.lower)} to {_percent(whole.upper)}, 95 %)."
-    )
+    estimate = f"with {describe_errors(stated.errors.name)} {EVENTS[counts]} in {_counted(whole)}."
     if left_out != [_NEVER_JUDGED]:
         estimate = f"{estimate} Not judged: {', '.join(left_out)}."
+    if stated.held is not None and stated.straight is not None:
+        estimate = (
+            f"{estimate} The hand-over alone, as friction decides it in simulation: held in {_counted(stated.held)}, "
+            f"held straight in {_counted(stated.straight)}. Not in it: tissue, thread, the surgeon."
+        )
     under = tuple(
         f"{one.errors.name}: {one.errors.describe()}; every pass {OF_A_PASS[counts]} with a probability of at least "
         f"{min((each.succeeds.lower for each in one.passes), default=0.0):.3f} (95 %)"
@@ -182,6 +184,13 @@ def describe_errors(name: str) -> str:
     if name not in NAMED:
         return f"the stated errors {name!r}"
     return f"the errors of {'an' if name[0] in 'aeiou' else 'a'} {name} arm"
+
+
+def _counted(one: Probability) -> str:
+    return (
+        f"{one.count} of {one.of} worlds: {_percent(one.probability)} ({_percent(one.lower)} to {_percent(one.upper)}, "
+        "95 %)"
+    )
 
 
 def _percent(part: float) -> str:
