@@ -84,17 +84,23 @@ def _estimated(plan: PlanDescription, report: Verdict, errors: ArmErrors) -> _Es
     estimate = f"with {describe_errors(stated.errors.name)} {EVENTS[counts]} in {_counted(whole)}."
     if left_out != [_NEVER_JUDGED]:
         estimate = f"{estimate} Not judged: {', '.join(left_out)}."
-    if stated.held is not None and stated.straight is not None:
-        estimate = (
-            f"{estimate} The hand-over alone, as friction decides it in simulation: held in {_counted(stated.held)}, "
-            f"held straight in {_counted(stated.straight)}. Not in it: tissue, thread, the surgeon."
-        )
+    estimate = " ".join(filter(None, [estimate, hand_over(stated)]))
     under = tuple(
         f"{one.errors.name}: {one.errors.describe()}; every pass {OF_A_PASS[counts]} with a probability of at least "
         f"{min((each.succeeds.lower for each in one.passes), default=0.0):.3f} (95 %)"
         for one in report.estimate.under
     )
     return _Estimated(whole, counts, estimate, under, tuple(left_out), costs_most(report))
+
+
+def hand_over(under: EstimateUnder) -> str | None:
+    """Return the sentence on how friction would let PSM_M take the needle; None where a pass has no hand-off."""
+    if under.held is None or under.straight is None:
+        return None
+    return (
+        f"The hand-over alone, as friction decides it in simulation: held in {_counted(under.held)}, held straight in "
+        f"{_counted(under.straight)}. Not in it: tissue, thread, the surgeon."
+    )
 
 
 def judged_under(report: Verdict, errors: ArmErrors) -> EstimateUnder:

@@ -25,7 +25,7 @@ from skills.formats.verify import PLAN, POLICY, README, SEGMENTS, SIGNATURE, VER
 from skills.library.operation import proofs
 from skills.library.operation.integrity import learnt, learnt_in, planned
 from skills.library.plans.description import describe_motion, describe_plan
-from skills.library.plans.headline import OF_WORLDS, counted_as, describe_errors, not_judged
+from skills.library.plans.headline import OF_WORLDS, counted_as, describe_errors, hand_over, not_judged
 from skills.library.plans.plans import find_plan, followed_plan, trajectory_of
 from skills.library.plans.replay_gate import ReplayConditions, cleared
 from skills.library.policies.combined import learnt_from
@@ -157,6 +157,7 @@ def _readme(
         stated_by=report.stated_by,
         errors=under.errors.describe(),
         not_judged=", ".join(not_judged(about, under)),
+        hand_over=hand_over(under),
         use=USE,
         signature=SIGNATURE,
         checkpoint=head.checkpoint,
