@@ -22,12 +22,12 @@ from math import isfinite, radians
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arithmetic import cos, sin
+from skills.arithmetic import arcsin, cos, sin
 from skills.arrays import Floats, frozen
 from skills.compiled import compiled
 from skills.errors import BadInput, BadSettings
 from skills.fields import Six
-from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, WRIST_MM, angle_between, axes_of, forward, instrument_of
+from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, WRIST_MM, axes_of, forward, instrument_of
 
 NOT_VALIDATED = (
     "Not validated on hardware: gains are published, loads are fitted to one arm, wrist and play are ranges."
@@ -191,11 +191,17 @@ def predict(
     off = []
     for arm in arms:
         there_mm, turned = forward(arm.joints, instrument)
-        off.append((np.linalg.norm(there_mm - tip_mm, axis=1), np.degrees(angle_between(rotation, turned))))
+        off.append((np.linalg.norm(there_mm - tip_mm, axis=1), _apart_deg(rotation, turned)))
     limit = np.array(instrument_of(instrument).arm.effort)
     off_mm, off_deg = (np.array([one[0], np.min(one, axis=0), np.max(one, axis=0)]) for one in zip(*off, strict=True))
     effort = np.max([np.abs(arm.efforts) / limit for arm in arms], axis=0)
     return Prediction(arms[0], off_mm, off_deg, effort, tuple(arms[1:]))
+
+
+def _apart_deg(rotation: Floats, other: Floats) -> Floats:
+    """Return the angles between rotations, (T, 3, 3), from the distance between their axes, shape (T,)."""
+    chords = (other - rotation).reshape(-1, 9).T
+    return np.asarray(np.degrees(2 * arcsin(np.minimum(np.sqrt(sum(one * one for one in chords) / 8), 1.0))))
 
 
 def loads(joints: Floats) -> Floats:
