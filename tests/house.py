@@ -21,7 +21,17 @@ from statistics import median
 
 FREE = "dict[str, Any]"
 QUESTION_WORDS = ("What", "Who", "Whose", "How", "Where", "Whether", "Why", "When", "Which")
-PURE = ("demonstration", "gridworld", "learning", "planning", "verification", "comparison", "scoring", "kinematics")
+PURE = (
+    "demonstration",
+    "gridworld",
+    "learning",
+    "planning",
+    "verification",
+    "comparison",
+    "scoring",
+    "kinematics",
+    "dynamics",
+)
 LONGEST_TEST_NAME = 70
 CEILING = 47_500
 FREE_OBJECTS = 50

@@ -180,7 +180,7 @@ def test_no_array_is_loaded_or_saved_with_pickles_in_it():
 
 
 ROOMS = ("demonstration", "gridworld", "learning", "planning", "verification", "comparison", "scoring")
-ALONE = ("arithmetic", "arrays", "kinematics", "quaternions")
+ALONE = ("arithmetic", "arrays", "dynamics", "kinematics", "quaternions")
 DOMAIN = [file for file in FILES if named(file).split("/")[0].removesuffix(".py") in (*ROOMS, *ALONE)]
 MAY_IMPORT = {
     *("bisect", "collections", "dataclasses", "functools", "itertools", "math", "types", "typing"),

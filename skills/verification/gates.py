@@ -30,6 +30,7 @@ ROUND_OFF = 2e-9  # rad and mm: a joint may be as far beyond its limit as `inver
 COUNT = np.array([7.72e-6, 7.72e-6, 1.296e-3, *[1.341e-4] * 3])
 WAVE_S = 0.01  # ours: a wave of 50 Hz turns from one such step to the next
 NEEDLE_TO_ARM = "distance of the needle from the other arm"
+TIP_WAYS = ("path off the policy's cells", "path off the recording")  # of the deviations, those of the tip's way
 SCENE = "clearance of the scene"  # the quantity of a failure beside tissue or an obstacle
 
 
@@ -280,17 +281,47 @@ def first_failure(
     Returns:
         The failure, or None if every sample passes every gate.
     """
-    gates = [*_gates(figures, playback, trajectory, limits)]
-    if outer is not None:
-        pair = "outer bodies" if outer.first is None else str(outer.first)
-        gates.append(_Gate(f"clearance of {pair}", "mm", outer.at_least_mm, outer.report.limit_mm, at_least=True))
-    if beside is not None:
-        gates.append(_Gate(SCENE, "mm", beside.at_least_mm, beside.report.limit_mm, at_least=True))
-        gates.append(_Gate("distance of the needle from the tissue", "mm", beside.needle_mm, 0.0, at_least=True))
+    gates = [*_gates(figures, playback, trajectory, limits), *_gates_beside(beside, outer)]
     if needle_mm is not None:
         gates.append(_Gate(NEEDLE_TO_ARM, "mm", needle_mm, limits.clearance_psm_m_mm, at_least=True))
     if intent is not None:
         gates += [_Gate(kind, LIMITS[kind][0], values, LIMITS[kind][1]) for kind, values in intent.values.items()]
+    return _earliest(gates, trajectory)
+
+
+def first_executed_failure(
+    joints: Floats,
+    trajectory: Trajectory,
+    limits: Limits,
+    beside: SceneClearance | None = None,
+    outer: BodiesClearance | None = None,
+    intent: Deviations | None = None,
+) -> Failure | None:
+    """Return the earliest sample at which an executed motion is beyond a limit that allows for errors of an arm.
+
+    These are the limits of joints, cannula and clearances, and of the tip's way along cells and recording. Limits for
+    poses that a plan states exactly, 0.05 mm and 0.1 degrees, no arm keeps: its error is reported instead.
+
+    Args:
+        joints: The joints that PSM_A executes, rad and mm, shape (T, 6).
+        trajectory: The planned motion.
+        limits: The limits of the gates.
+        beside: The executed motion's distances from a scene; None: they are no gate.
+        outer: The distances of the arms' outer bodies in it; None: they are no gate.
+        intent: Its deviations from what was asked; None: they are no gate.
+
+    Returns:
+        The failure, or None if every sample passes every gate.
+    """
+    gates = [*_limit_gates(PSM_A, joints, kinematics.instrument_of(trajectory.instrument), limits)]
+    gates += _gates_beside(beside, outer)
+    if intent is not None:
+        gates += [_Gate(kind, LIMITS[kind][0], intent.values[kind], LIMITS[kind][1]) for kind in TIP_WAYS]
+    return _earliest(gates, trajectory)
+
+
+def _earliest(gates: list[_Gate], trajectory: Trajectory) -> Failure | None:
+    """Return the earliest sample at which a gate is broken, with the first gate listed."""
     broken = [(sample, gate) for gate in gates if (sample := gate.broken()) is not None]
     if not broken:
         return None
@@ -308,6 +339,16 @@ def first_failure(
         worst=float(gate.values[worst]),
         worst_s=float(trajectory.stamps_s[worst]),
     )
+
+
+def _gates_beside(beside: SceneClearance | None, outer: BodiesClearance | None) -> Iterator[_Gate]:
+    """Yield the gates of distances that were found in closed form."""
+    if outer is not None:
+        pair = "outer bodies" if outer.first is None else str(outer.first)
+        yield _Gate(f"clearance of {pair}", "mm", outer.at_least_mm, outer.report.limit_mm, at_least=True)
+    if beside is not None:
+        yield _Gate(SCENE, "mm", beside.at_least_mm, beside.report.limit_mm, at_least=True)
+        yield _Gate("distance of the needle from the tissue", "mm", beside.needle_mm, 0.0, at_least=True)
 
 
 def _gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:
@@ -336,21 +377,30 @@ def _gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits:
 
 def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
     """Yield the gates of one arm's joints."""
-    prefix = "" if arm.name == PSM_A else f"{arm.name}'s "
-    spare = limits.joint_margin * (arm.tool.upper - arm.tool.lower) - ROUND_OFF
-    upper, lower = arm.tool.upper - spare, arm.tool.lower + spare
-    for joint, name in enumerate(kinematics.JOINTS):
-        values = arm.joints[:, joint]
-        yield _Gate(f"{prefix}{name}", kinematics.UNITS[joint], values, float(upper[joint]))
-        yield _Gate(f"{prefix}{name}", kinematics.UNITS[joint], values, float(lower[joint]), at_least=True)
-    least_mm = limits.insertion_mm + arm.tool.cannula_mm - kinematics.CANNULA_MM
-    yield _Gate(f"{prefix}insertion out of the cannula", "mm", arm.joints[:, kinematics.INSERTION], least_mm, True)
+    yield from _limit_gates(arm.name, arm.joints, arm.tool, limits)
+    prefix = _prefix(arm.name)
     for joint, name in enumerate(kinematics.JOINTS):
         yield _Gate(f"speed of {prefix}{name}", "of its limit", arm.speed[:, joint], limits.speed_ratio)
         accelerations = arm.acceleration[:, joint]
         yield _Gate(f"acceleration of {prefix}{name}", "of its limit", accelerations, limits.acceleration_ratio)
         yield _Gate(f"jerk of {prefix}{name}", "of the acceleration", arm.jerk[:, joint], limits.jerk_ratio)
         yield _Gate(f"vibration of {prefix}{name}", "encoder counts", arm.vibration[:, joint], limits.vibration_counts)
+
+
+def _prefix(name: str) -> str:
+    return "" if name == PSM_A else f"{name}'s "
+
+
+def _limit_gates(name: str, joints: Floats, tool: kinematics.InstrumentConstants, limits: Limits) -> Iterator[_Gate]:
+    """Yield the gates of one arm's joints against their limits and the cannula."""
+    spare = limits.joint_margin * (tool.upper - tool.lower) - ROUND_OFF
+    upper, lower, prefix = tool.upper - spare, tool.lower + spare, _prefix(name)
+    for joint, called in enumerate(kinematics.JOINTS):
+        values = joints[:, joint]
+        yield _Gate(f"{prefix}{called}", kinematics.UNITS[joint], values, float(upper[joint]))
+        yield _Gate(f"{prefix}{called}", kinematics.UNITS[joint], values, float(lower[joint]), at_least=True)
+    least_mm = limits.insertion_mm + tool.cannula_mm - kinematics.CANNULA_MM
+    yield _Gate(f"{prefix}insertion out of the cannula", "mm", joints[:, kinematics.INSERTION], least_mm, True)
 
 
 def _clearance_gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:

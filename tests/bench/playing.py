@@ -8,6 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from skills.arrays import xyz
+from skills.dynamics import Servo, predict
 from skills.gridworld.scene import Scene, Tissue
 from skills.kinematics import instrument_of
 from skills.library.plans.plans import trajectory_of
@@ -82,9 +83,16 @@ def verdicts(table: Table) -> None:
         beside, intent = clearance_of(trajectory, scene_mm), compare(given, trajectory, playback.joints)
         judge(playback, trajectory, beside=beside, pad_is_tissue=False, intent=intent)
 
-    alone, whole, bare = in_turn(closed_form, judged, lambda: plain(asked), rounds=ROUNDS)
+    def executed(ranged: bool) -> None:
+        predict(trajectory.joints, trajectory.stamps_s, Servo(), trajectory.instrument, ranged=ranged)
+
+    alone, one, five, whole, bare = in_turn(
+        closed_form, lambda: executed(False), lambda: executed(True), judged, lambda: plain(asked), rounds=ROUNDS
+    )
     table.add_row(f"verdict without a simulator, {PASSES} passes", f"{alone:.2f} s", f"{len(trajectory)} samples")
-    table.add_row("  with it, but for process and picture", f"{whole:.2f} s", "")
+    table.add_row("  the executed motion", f"{one:.2f} s", f"with it {1 + one / alone:.2f} of the verdict without")
+    table.add_row("  the executed motion with its range", f"{five:.2f} s", f"with it {1 + five / alone:.2f} of that")
+    table.add_row("  with a simulator, but for process and picture", f"{whole:.2f} s", "")
     table.add_row("  PyBullet's calls alone", f"{bare:.2f} s", f"the verdict takes {whole / bare:.2f} of it")
 
 

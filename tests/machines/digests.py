@@ -22,6 +22,7 @@ from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback,
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.demonstration.identification import identify
+from skills.dynamics import Servo, predict
 from skills.fields import as_json
 from skills.formats.parsed import parse_recording
 from skills.learning.dynamic_programming import ValueIteration
@@ -89,6 +90,7 @@ def made(folder: Path, *, night: bool) -> tuple[dict[str, str], dict[str, Any]]:
         digests["instrument of joints"] = bits(
             identify(arm["joints"], arm["tip"], arm["rotation"], speeds=arm["speeds"], in_base=False, stated=None)
         )
+        digests["executed motion"] = bits(predict(arm["joints"], np.arange(len(arm["joints"])) / arms.RATE_HZ, Servo()))
     with TemporaryDirectory() as place, closing(Database(f"sqlite:///{place}/machine.sqlite")) as database:
         database.migrate()
         cases.add_surgeon(database)

@@ -44,7 +44,8 @@ CHOSEN_BY_PROCESSOR = {
     "scipy": "Rotation Slerp gaussian_filter1d",
 }
 EXACT = """
-arithmetic quaternions kinematics comparison/combining formats/columns formats/jigsaws gridworld/domain gridworld/grid
+arithmetic quaternions kinematics dynamics comparison/combining formats/columns formats/jigsaws gridworld/domain
+gridworld/grid
 gridworld/reward gridworld/scene learning/certificate learning/evaluation learning/in_scene learning/pose_style
 learning/q_learning gridworld/slip learning/slip_runs learning/tube
 planning/handoff planning/motion_laws planning/passes planning/path_fit
