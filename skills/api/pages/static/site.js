@@ -48,10 +48,11 @@ export function drawing(name, attributes, text) {
   return made;
 }
 
-// A share in percent, as the filter `share` words it: less than all is never 100 %.
+// A share in percent, as the filter `share` words it: less than all is never 100 %, and more than nothing never 0 %.
 export function percent(share, digits = 0) {
-  const text = (100 * share).toFixed(digits);
-  return share < 1 && Number(text) >= 100 ? `> ${(100 - 10 ** -digits).toFixed(digits)} %` : `${text} %`;
+  const text = (100 * share).toFixed(digits), least = 10 ** -digits;
+  if (share < 1 && Number(text) >= 100) return `> ${(100 - least).toFixed(digits)} %`;
+  return share > 0 && Number(text) <= 0 ? `< ${least.toFixed(digits)} %` : `${text} %`;
 }
 
 // Make a row of a table of figures, as the macro `row` does.
