@@ -154,6 +154,7 @@ class Headline(Given):
         under: A sentence on each of the errors of the arms under which the passes were judged.
         not_judged: What the probability leaves out, in words.
         costs_most: The error that costs the most, in words; null where none was judged.
+        hand_over: How often friction would let PSM_M hold the needle, and straight, in words; null without a hand-off.
     """
 
     level: Level
@@ -167,6 +168,7 @@ class Headline(Given):
     under: list[str]
     not_judged: list[str]
     costs_most: str | None
+    hand_over: str | None
 
 
 class Playback(Given):

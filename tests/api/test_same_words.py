@@ -111,9 +111,8 @@ def test_all_doors_say_the_same_of_a_plan(
         readme = zipfile.ZipFile(io.BytesIO(bag.content)).read("README.txt").decode()
         assert f"Not judged: {', '.join(line['not_judged'])}." in readme
         assert made["description"] in readme
-        alone = re.findall(r"The hand-over alone.*?the surgeon\.", line["text"])
-        assert (len(alone) == 1) == (line["counts"] == "hand-over")
-        assert all(one in " ".join(readme.split()) for one in alone)
+        assert (line["hand_over"] is None) == (line["counts"] != "hand-over")
+        assert (line["hand_over"] or "") in " ".join(readme.split())
 
 
 def test_style_and_card_state_up_to_where_an_action_is_optimal(still: Service) -> None:

@@ -46,7 +46,8 @@ def headline(plan: PlanDescription, report: Verdict, *, errors: ArmErrors, lower
     elif said.estimate is None:
         verdict = f"feasible in an exact simulation. {said.unjudged}"
     else:
-        verdict = " ".join(filter(None, [f"feasible in an exact simulation; {said.estimate}", said.costs_most]))
+        found = [f"feasible in an exact simulation; {said.estimate}", said.costs_most, said.hand_over]
+        verdict = " ".join(filter(None, found))
     return Headline(
         level=level,
         word=word,
@@ -59,6 +60,7 @@ def headline(plan: PlanDescription, report: Verdict, *, errors: ArmErrors, lower
         under=[*said.under],
         not_judged=[*said.not_judged],
         costs_most=said.costs_most,
+        hand_over=said.hand_over,
     )
 
 
@@ -71,6 +73,7 @@ class _Estimated(NamedTuple):
     under: tuple[str, ...] = ()
     not_judged: tuple[str, ...] = ()
     costs_most: str | None = None
+    hand_over: str | None = None
     unjudged: str = ""
 
 
@@ -84,13 +87,12 @@ def _estimated(plan: PlanDescription, report: Verdict, errors: ArmErrors) -> _Es
     estimate = f"with {describe_errors(stated.errors.name)} {EVENTS[counts]} in {_counted(whole)}."
     if left_out != [_NEVER_JUDGED]:
         estimate = f"{estimate} Not judged: {', '.join(left_out)}."
-    estimate = " ".join(filter(None, [estimate, hand_over(stated)]))
     under = tuple(
         f"{one.errors.name}: {one.errors.describe()}; every pass {OF_A_PASS[counts]} with a probability of at least "
         f"{min((each.succeeds.lower for each in one.passes), default=0.0):.3f} (95 %)"
         for one in report.estimate.under
     )
-    return _Estimated(whole, counts, estimate, under, tuple(left_out), costs_most(report))
+    return _Estimated(whole, counts, estimate, under, tuple(left_out), costs_most(report), hand_over(stated))
 
 
 def hand_over(under: EstimateUnder) -> str | None:
