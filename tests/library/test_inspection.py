@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import select, text
@@ -243,10 +244,10 @@ def test_a_file_whose_pages_are_damaged_is_told(damaged: Database, tmp_path: Pat
 
 
 def test_what_a_full_disk_keeps_from_being_decoded_is_left_out(damaged: Database):
-    def parse(*_: object, **__: object) -> None:
+    def parse(*_: Any, **__: Any) -> Any:
         raise StorageFull("The disk is full.")
 
-    parts = {part.what: part for part in inspect_installation(damaged, parse)}  # type: ignore[arg-type]
+    parts = {part.what: part for part in inspect_installation(damaged, parse)}
     assert not any(part.wrong for part in parts.values())
     ((name, why),) = parts["recordings decoded"].left_out
     assert (name.split()[0], why, parts["recordings decoded"].count) == ("recordings", "The disk is full.", 1)
