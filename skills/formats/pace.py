@@ -64,7 +64,7 @@ def _unusual(recording: Recording, pace: MotionPace) -> str | None:
     if recording.format != "csv" or pace.speed_mm_s >= least:
         return None
     wide = any(np.ptp(motion.tip_mm, axis=0).max() > SMALL_MM for motion in recording.motions)
-    return f"a hand-off is faster than {least:g} mm/s" if wide else None
+    return f"known hand-offs are faster than {least:g} mm/s, other work is not always" if wide else None
 
 
 def _time_of(recording: Recording) -> Column | None:

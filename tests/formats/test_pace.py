@@ -1,6 +1,8 @@
 """Times, lengths and steps that no PSM's recording has are refused, and questionable ones asked about."""
 
 import io
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -245,3 +247,24 @@ def test_no_file_in_another_unit_is_taken_silently_and_wrongly(count):
 @pytest.mark.parametrize("count", [60, pytest.param(2000, marks=pytest.mark.nightly)])
 def test_no_sound_file_is_refused(count):
     assert {what for _, what in scalings.outcomes(count, seed=1, are_sound=True)} == {"right"}
+
+
+@pytest.mark.needs("benchmarks")
+@pytest.mark.parametrize("hz", [10, pytest.param(30, marks=pytest.mark.nightly), 50])
+def test_insertions_at_a_guessed_rate_are_asked_about_and_never_refused(hz):
+    """Nobody recorded the rate of the d-lfd insertions, which are no hand-offs: they may be slow, and who states units
+    is believed. The share that is asked about without them stands in docs/tables.md."""
+    stored = np.load(Path(os.environ["SKILLS_TEST_BENCHMARKS"]) / "dlfd_insertions.npz")
+    stated = {"column": ["t_s=t_s", *(f"{axis}_mm={axis}_mm" for axis in "xyz")], "frame": "base"}
+    asked = 0
+    for which in np.unique(stored["insertion"]):
+        rows = stored["insertion"] == which
+        for arm in (0, 1):
+            turned = dict(zip(("qx", "qy", "qz", "qw"), stored["quaternion"][rows, arm].T, strict=True))
+            made = table(np.arange(rows.sum()) / hz, stored["position_mm"][rows, arm], **turned)
+            assert len(read(made, **stated).motion_of().stamps_ns) == rows.sum()
+            try:
+                read(made)
+            except errors.ImplausibleMotion as question:
+                asked += "known hand-offs are faster than 7 mm/s" in str(question)
+    assert asked == {10: 80, 30: 80, 50: 26}[hz]
