@@ -571,13 +571,17 @@ def stands_from(trajectory: Trajectory, end: int) -> int:
 
     Args:
         trajectory: The motion.
-        end: The index of a sample; NaN stands nowhere else.
+        end: The index of a sample.
     """
-    moved = np.zeros(end + 1, bool)
-    for arm in trajectory.arms:
-        moved |= ~(np.abs(arm.joints[: end + 1] - arm.joints[end]) <= STANDS).all(axis=1)
-    moved[end] = False
-    return end - int(np.argmax(np.append(moved[::-1], True))) + 1
+    first = end
+    while first > 0:
+        begin = max(2 * first - end - 64, 0)  # stands are short: look back twice as far each time
+        still = [(np.abs(arm.joints[begin:first] - arm.joints[end]) <= STANDS).all(axis=1) for arm in trajectory.arms]
+        moved = np.flatnonzero(~np.logical_and.reduce(still))
+        if len(moved):
+            return begin + int(moved[-1]) + 1
+        first = begin
+    return first
 
 
 def seconds_by_phase(trajectory: Trajectory) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """Trajectories: laws of motion, transfers, and the other arm."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from skills.planning.trajectory import (
     joint_ratios,
     seams,
     seconds_by_phase,
+    stands_from,
     time_parametrise,
     transfers,
 )
@@ -515,3 +516,14 @@ def test_the_same_plan_gives_the_same_bytes_of_both_arms():
     one, other = planned(2), planned(2)
     assert one.psm_m.joints.tobytes() == other.psm_m.joints.tobytes()
     assert one.joints.tobytes() == other.joints.tobytes()
+
+
+@examples(60)
+@given(held=st.integers(0, 500), end=st.integers(0, 600))
+def test_a_stand_begins_after_the_last_sample_that_differs(held, end):
+    motion = small_trajectory()
+    joints = motion.joints.copy()
+    joints[max(end - held, 0) : end + 1] = joints[end]
+    begins = stands_from(replace(motion, joints=joints), end)
+    stood = (np.abs(joints[: end + 1] - joints[end]) <= 1e-6).all(axis=1)
+    assert stood[begins:].all() and (begins == 0 or not stood[begins - 1])
