@@ -26,7 +26,7 @@ from skills.arithmetic import arcsin, cos, sin
 from skills.arrays import Floats, frozen
 from skills.compiled import compiled
 from skills.errors import BadInput, BadSettings
-from skills.fields import Six
+from skills.fields import Six, exact, schema
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, WRIST_MM, axes_of, forward, instrument_of
 
 NOT_VALIDATED = (
@@ -46,9 +46,11 @@ _LOADS = np.array(
 Ends = tuple[Six, Six]  # the lower and the upper end of a range, for each joint
 
 
+@exact
+@schema
 @dataclass(frozen=True)
 class Servo:
-    """How a laboratory drives its arm, and what is known of the arm; per joint rad, m, Nm, N.
+    """How a laboratory drives its arm, what is known of the arm, and what error it allows; per joint rad, m, Nm, N.
 
     The ranges of yaw, pitch and insertion are the fit and a fifth either way (ours: of one arm): 0.187, 0.203, 0.898
     for I, 0.101, 0.204, 1.78 for Fv and 0.056, 0.075, 0.411 for Fc.
@@ -69,6 +71,10 @@ class Servo:
         compensation: The part of its load that is compensated, where it is. Ours: a tenth either way; setpoints beside
             measured joints of a published arm show 0.92 to 1.12 (KinematicCalibDVRK).
         step_s: Longest step of the integration. The controllers' own loop has 0.67 to 1 ms.
+        most_mm: Greatest error of the tip that the laboratory allows. Ours: the mean error of an uncalibrated arm, as
+            with more than that the stated errors of the arms (`skills.verification.arm_errors`) are no longer true.
+        most_deg: The same of the jaws' rotation. Ours: two standard deviations of an uncalibrated arm's wrist.
+        most_effort: The greatest effort, as a part of its limit; at the limit an arm no longer follows.
     """
 
     velocities: bool = True
@@ -84,9 +90,12 @@ class Servo:
     load: Ends = ((0.8,) * 6, (1.2,) * 6)
     compensation: Ends = ((0.9,) * 6, (1.1,) * 6)
     step_s: float = 0.001
+    most_mm: float = 2.96
+    most_deg: float = 6.0
+    most_effort: float = 0.95
 
     def __post_init__(self) -> None:
-        for name in ("rate_hz", "step_s"):
+        for name in ("rate_hz", "step_s", "most_mm", "most_deg", "most_effort"):
             if not (isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise BadSettings(f"{name} of a servo must be above 0.", given=getattr(self, name))
         if not (isfinite(self.delay_s) and self.delay_s >= 0):

@@ -84,6 +84,12 @@ def schema(cls: type[T]) -> type[T]:
     return cls
 
 
+def exact(cls: type[T]) -> type[T]:
+    """Refuse JSON of a schema with names that are no fields: a mistyped one must not leave a default in force."""
+    cls.__pydantic_config__["extra"] = "forbid"  # type: ignore[attr-defined]
+    return cls
+
+
 def _describe(json: dict[str, Any], cls: type) -> None:
     """Add the docstring's text, and the sections Attributes of the class and its bases, to a JSON schema."""
     for field in json["properties"].values():
