@@ -243,18 +243,18 @@ def execute(joints: Floats, stamps_s: Floats, servo: Servo, arm: Floats, instrum
     plan, stamps = joints * _UNITS, stamps_s - stamps_s[0]
     speeds = np.gradient(plan, stamps, axis=0) if servo.velocities and len(plan) > 1 else np.zeros_like(plan)
     waves = np.concatenate([sin(plan[:, :2]), cos(plan[:, :2])], axis=1)
-    motor, link, effort, friction = np.zeros((4, *plan.shape))
+    motor, link, effort, friction, load = np.zeros((5, *plan.shape))
     share, stiffness = arm[6] - arm[7], arm[0]
     motor[0] = plan[0]
     for _ in range(5):  # a fixed point: the load changes with the droop by less than a tenth of it
-        motor[0] = plan[0] - share * loads(motor[:1] / _UNITS)[0] / stiffness
-    link[0], effort[0] = motor[0], arm[6] * loads(motor[:1] / _UNITS)[0]
+        load[0] = loads(motor[:1] / _UNITS)[0]
+        motor[0] = plan[0] - share * load[0] / stiffness
+    link[0], effort[0] = motor[0], arm[6] * load[0]
     stream = np.array([servo.step_s, servo.rate_hz, servo.delay_s])
     parts = np.concatenate([arm, [instrument_of(instrument).arm.effort]])
     state = np.array([motor[0], np.zeros(6)])
-    _run(stamps, plan, speeds, waves, _LOADS.copy(), parts, stream, state, motor, link, effort, friction)
-    droop = -share * loads(motor / _UNITS) / stiffness
-    stick = (link - motor) - friction / stiffness
+    _run(stamps, plan, speeds, waves, _LOADS.copy(), parts, stream, state, motor, link, effort, friction, load)
+    droop, stick = -share * load / stiffness, (link - motor) - friction / stiffness
     return Executed(link / _UNITS, effort, droop / _UNITS, (link - plan - droop - stick) / _UNITS, stick / _UNITS)
 
 
@@ -272,8 +272,9 @@ def _run(
     link: Floats,
     effort: Floats,
     friction: Floats,
+    weight: Floats,
 ) -> None:
-    """Fill in motors, links, efforts and dry friction, (T, 6), from their first rows; `state`: places and speeds."""
+    """Fill in motors, links, efforts, dry friction and loads, (T, 6), from their first rows; `state`: place, speed."""
     step, rate, delay = stream[0], stream[1], stream[2]
     known = 0
     for k in range(1, len(stamps)):
@@ -320,7 +321,7 @@ def _run(
                 state[0, j] = x + h / 2 * (free - taken)
                 state[1, j] = free - taken
                 if i == steps - 1:
-                    effort[k, j], friction[k, j] = e, taken * mass / h
+                    effort[k, j], friction[k, j], weight[k, j] = e, taken * mass / h, load
         for j in range(6):
             motor[k, j] = state[0, j]
             link[k, j] = min(max(link[k - 1, j], state[0, j] - parts[5, j]), state[0, j] + parts[5, j])

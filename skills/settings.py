@@ -81,6 +81,9 @@ class Settings(BaseSettings):
     # errors of the arms (docs/errors.md), under which every pass must succeed: uncalibrated, calibrated, or the JSON of
     # a laboratory's own, or a file with it ...
     arm_errors: str = "uncalibrated"
+    # how PSM_A is driven and what errors it is allowed (docs/execution.md), as JSON or a file with it; "" for verdicts
+    # that say "not executed"
+    servo: str = ""
     # ... with this probability
     replay_lower_bound: float = Field(default=0.95, ge=0, le=1)
     # the release gate requires that every start so near to the demonstrated one, an uncalibrated arm's error, ...
@@ -120,10 +123,10 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = "warning"  # "info" adds a line for each request and job
     log_format: Literal["text", "json"] = "text"
 
-    @field_validator("arm_errors")
+    @field_validator("arm_errors", "servo")
     @classmethod
     def _content_of_file(cls, stated: str) -> str:
-        """Return the name or the JSON of the arms' errors as it is, and of a file the content."""
+        """Return the name or the JSON of what is stated of the arms as it is, and of a file the content."""
         file = Path(stated)
         return file.read_text() if file.suffix == ".json" else stated
 

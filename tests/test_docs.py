@@ -57,6 +57,7 @@ RUN_BY: dict[str, list[str]] = {
     "contact.md": [RUN],
     "engineer.md": 7 * [RUN],
     "joining.md": [RUN],
+    "execution.md": ["tests/library/test_arm_errors.py::test_the_servo_of_the_page_is_one"],
     "keys.md": 2 * [KEYS + ALL_COMMANDS]
     + 2 * [KEYS + "test_the_settings_of_the_page_are_those_there_are_with_these_defaults"],
     "lerobot.md": [

@@ -30,7 +30,7 @@ from skills.errors import NotReady, SkillsError
 from skills.jobs import Engine
 from skills.library.operation.history import sign_some_history
 from skills.library.people.suture_types import seed_suture_types
-from skills.library.plans.arm_errors import stated_errors
+from skills.library.plans.arm_errors import stated_errors, stated_servo
 from skills.library.recordings.recordings import confined_reader
 from skills.logs import request_id
 from skills.settings import Settings
@@ -59,6 +59,7 @@ def create_app(settings: Settings, *, by_path: bool = False, engine: type[Engine
         BadSettings: The installation states impossible errors of its arms.
     """
     stated_errors(settings.arm_errors)
+    stated_servo(settings.servo)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

@@ -1,6 +1,7 @@
 """Commands of plans: where one is possible, its verdict, and the bag that a robot replays."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -153,19 +154,24 @@ def plans(plan_id: Annotated[str | None, typer.Argument(metavar="PLAN")] = None)
 
 @command(commands)
 def play(
-    plan_id: PlanId, errors: str | None = None, picture: Path | None = None, pictures: Path | None = None
+    plan_id: PlanId,
+    errors: str | None = None,
+    servo: Path | None = None,
+    picture: Path | None = None,
+    pictures: Path | None = None,
 ) -> Answer:
     """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible.
 
     Args:
         errors: Errors of the arms: calibrated, uncalibrated, or a JSON file with your own (docs/errors.md).
+        servo: A JSON file that says how PSM_A is driven (docs/execution.md).
         picture: Write a picture here.
         pictures: Write the picture, a film and two plots to this folder.
     """
     from skills.schemas.results import PlaybackResult
 
     with service(workers=1) as client:
-        job = finished(client, client.play(plan_id, arm_errors_of(errors)))
+        job = finished(client, client.play(plan_id, arm_errors_of(errors), servo_of(servo)))
         playback = client.playback(PlaybackResult.of(job).playback)
         if picture is not None:
             picture.write_bytes(client.picture(playback.id))
@@ -182,23 +188,35 @@ def play(
 
 
 def arm_errors_of(errors: str | None) -> Any:
-    """Return the errors of the arms as a request states them: a name, or the JSON of a file.
-
-    Raises:
-        BadInput: The file cannot be read, or does not have the errors of an arm.
-    """
+    """Return the errors of the arms as a request states them: a name, or the JSON of a file; raises as `_stated`."""
     from skills.library.plans.arm_errors import stated_errors
 
     if errors is None or errors in ("calibrated", "uncalibrated"):
         return errors
+    remedy = "Write calibrated, uncalibrated, or a file of `skills calibrate-arm` (docs/errors.md)."
+    return _stated("errors", Path(errors), stated_errors, remedy)
+
+
+def servo_of(servo: Path | None) -> Any:
+    """Return how an arm is driven as a request states it, the JSON of a file; raises as `_stated`."""
+    from skills.library.plans.arm_errors import stated_servo
+
+    return None if servo is None else _stated("servo", servo, stated_servo, "docs/execution.md has an example.")
+
+
+def _stated(option: str, file: Path, check: Callable[[str], object], remedy: str) -> Any:
+    """Return the JSON of a file.
+
+    Raises:
+        BadInput: The file cannot be read, or does not have what the option is for.
+    """
     try:
-        text = Path(errors).read_text()
-        stated_errors(text)
+        text = file.read_text()
+        check(text)
         return json.loads(text)
     except (OSError, ValueError, BadSettings) as error:
         why = error.message if isinstance(error, BadSettings) else f"It cannot be read: {error}."
-        remedy = "Write calibrated, uncalibrated, or a file of `skills calibrate-arm` (docs/errors.md)."
-        raise BadInput(f"--errors {errors}: {why}", remedy) from None
+        raise BadInput(f"--{option} {file}: {why}", remedy) from None
 
 
 @command(commands)

@@ -6,11 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter
 
+from skills.dynamics import Servo
 from skills.fields import Count, Point, Sha256, schema
 from skills.packing import canonical, sha256
 from skills.schemas import Given, PolicyName
 from skills.schemas.requests import LINE, DigestField, Schema, Size, Source, shown
 from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
+from skills.verification.execution import ExecutionReport
 from skills.verification.probabilities import Probability, SuccessEstimate
 from skills.verification.scene_clearance import SceneReport
 from skills.verification.verdict import PlaybackReport
@@ -64,12 +66,14 @@ class PlaybackIn(Schema):
 
     Attributes:
         errors: The errors of the arms that are to play it; by default those of the installation.
+        servo: How PSM_A is driven (docs/execution.md); by default as the installation states.
     """
 
     model_config = shown({"plan": "0123456789abcdef" * 4}, {"plan": "0123456789abcdef" * 4, "errors": "calibrated"})
 
     plan: DigestField
     errors: ErrorsIn = None
+    servo: Servo | None = None
 
     @property
     def arm_errors(self) -> ArmErrors | None:
@@ -91,6 +95,7 @@ class Verdict(PlaybackReport):
         frame: Frame of the plan.
         scene: Distances from the plan's scene; null: it has none, so nothing was compared with tissue.
         tissue: Whether the motion was compared with tissue.
+        executed: The motion that PSM_A is predicted to execute; null: not executed, as nobody states how it is driven.
         stated_by: Source of the errors of the arms, the playback's request or the installation.
         check_version: Version of the checks; a bag is given only of the present one.
     """
@@ -103,6 +108,7 @@ class Verdict(PlaybackReport):
     frame: str
     scene: SceneReport | None
     tissue: Literal["judged", "not given"]
+    executed: ExecutionReport | None
     stated_by: Literal["request", "installation"]
     check_version: Count
 
@@ -155,6 +161,7 @@ class Headline(Given):
         not_judged: What the probability leaves out, in words.
         costs_most: The error that costs the most, in words; null where none was judged.
         hand_over: How often friction would let PSM_M hold the needle, and straight, in words; null without a hand-off.
+        executed: The predicted error of PSM_A in words, or that it was not executed.
     """
 
     level: Level
@@ -169,6 +176,7 @@ class Headline(Given):
     not_judged: list[str]
     costs_most: str | None
     hand_over: str | None
+    executed: str
 
 
 class Playback(Given):

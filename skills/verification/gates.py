@@ -6,7 +6,7 @@ The figures are arrays with one row per sample, which are gated and reported. A 
 not exceed its limit, or must not fall below it. NaN passes no gate. All of this is ours.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -293,19 +293,21 @@ def first_executed_failure(
     joints: Floats,
     trajectory: Trajectory,
     limits: Limits,
+    errors: Mapping[str, tuple[str, Floats, float]] | None = None,
     beside: SceneClearance | None = None,
     outer: BodiesClearance | None = None,
     intent: Deviations | None = None,
 ) -> Failure | None:
     """Return the earliest sample at which an executed motion is beyond a limit that allows for errors of an arm.
 
-    These are the limits of joints, cannula and clearances, and of the tip's way along cells and recording. Limits for
-    poses that a plan states exactly, 0.05 mm and 0.1 degrees, no arm keeps: its error is reported instead.
+    These are the limits of joints, cannula and clearances, of the tip's way along cells and recording, and those that a
+    laboratory sets. Limits for poses that a plan states exactly, 0.05 mm and 0.1 degrees, no arm keeps.
 
     Args:
         joints: The joints that PSM_A executes, rad and mm, shape (T, 6).
         trajectory: The planned motion.
         limits: The limits of the gates.
+        errors: Further quantities by name: their unit, their values, shape (T,), and the greatest that is allowed.
         beside: The executed motion's distances from a scene; None: they are no gate.
         outer: The distances of the arms' outer bodies in it; None: they are no gate.
         intent: Its deviations from what was asked; None: they are no gate.
@@ -314,6 +316,7 @@ def first_executed_failure(
         The failure, or None if every sample passes every gate.
     """
     gates = [*_limit_gates(PSM_A, joints, kinematics.instrument_of(trajectory.instrument), limits)]
+    gates += [_Gate(name, *one) for name, one in (errors or {}).items()]
     gates += _gates_beside(beside, outer)
     if intent is not None:
         gates += [_Gate(kind, LIMITS[kind][0], intent.values[kind], LIMITS[kind][1]) for kind in TIP_WAYS]

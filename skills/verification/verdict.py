@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from skills import kinematics
 from skills.arrays import Floats, frozen
 from skills.demonstration.demonstration import Demo
+from skills.dynamics import Servo
 from skills.errors import BadInput
 from skills.fields import Count, Figure, Sha256, schema
 from skills.learning.policy import Policy
@@ -33,6 +34,7 @@ from skills.verification.arm_errors import UNCALIBRATED, ArmErrors
 from skills.verification.bodies import BodiesReport, bodies_clearance
 from skills.verification.clearance import psm_m_poses
 from skills.verification.deviations import Deviations, Mismatch
+from skills.verification.execution import ExecutionReport, PlannedMotion, execution_of
 from skills.verification.gates import SCENE, ArmSamples, Failure, Figures, Limits, figures_of, first_failure
 from skills.verification.intent import compare
 from skills.verification.monte_carlo import estimate_success
@@ -308,11 +310,13 @@ class PlanVerdict:
         report: The motion as it was played, compared with the limits, with the scene, and with what was asked.
         scene: Its distances from the plan's scene; None if the plan has none.
         success: The probability of success when arms and world differ from the plan.
+        executed: The motion that PSM_A is predicted to execute; None: the laboratory does not state how it is driven.
     """
 
     report: PlaybackReport
     scene: SceneReport | None
     success: SuccessEstimate
+    executed: ExecutionReport | None
 
     @property
     def failure_sentence(self) -> str | None:
@@ -323,9 +327,11 @@ class PlanVerdict:
             if self.scene is None
             else [one for one in self.scene.nearest if (one.body, one.part) != (NEEDLE, TISSUE)]
         )
-        if failure is None or failure.quantity != SCENE or not near:
-            return None if failure is None else str(failure)
-        return f"{failure} Nearest: {near[0]}."
+        if failure is None:
+            return None
+        if self.executed is not None and failure is self.executed.failure:
+            return f"As executed. {failure}"
+        return f"{failure} Nearest: {near[0]}." if failure.quantity == SCENE and near else str(failure)
 
 
 def judge_plan(
@@ -336,6 +342,7 @@ def judge_plan(
     policy: Policy,
     demo: Demo | None,
     errors: ArmErrors = UNCALIBRATED,
+    servo: Servo | None = None,
 ) -> PlanVerdict:
     """Compare a plan as it was played with what was asked, its scene and the limits, and count how often it succeeds.
 
@@ -346,18 +353,27 @@ def judge_plan(
         policy: The policy that the plan follows.
         demo: The demonstration whose hand it follows, as `stack` was given it; None for a plan along cell centres.
         errors: The stated errors of the arms.
+        servo: How PSM_A is driven; None: its executed motion is not predicted.
 
     Returns:
-        The verdict, its distances from the scene, and the probability of success.
+        The verdict, its distances from the scene, the probability of success, and the executed motion. A plan that is
+        feasible as planned is not if PSM_A, in the middle of what is known of it, leaves a limit.
 
     Raises:
         BadInput: The playback is not of this trajectory.
     """
     approach_m = None if plan.psm_m is None else plan.psm_m.approach
     beside = None if plan.scene is None else clearance_of(trajectory, plan.scene)
-    intent = compare(requested_motion(plan, policy, demo), trajectory, playback.joints)
+    request = requested_motion(plan, policy, demo)
+    intent = compare(request, trajectory, playback.joints)
     # The simulator's pad lies below the motion wherever that goes, so it is no tissue and no gate.
     report = judge(playback, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
+    executed = None
+    if servo is not None:
+        known = PlannedMotion(request, plan.scene, approach_m, intent, beside, report.bodies.at_least_mm)
+        executed = execution_of(trajectory, servo, known).report(trajectory, servo)
+        if report.feasible and executed.surely:
+            report = replace(report, feasible=False, failure=executed.failure)
     tissue = None if plan.scene is None else plan.scene.tissue
     top = (None, UPWARDS) if tissue is None or beside is None else flat_tissue(trajectory, beside.report, tissue)
     success = estimate_success(
@@ -368,7 +384,7 @@ def judge_plan(
         needle_mm=None if beside is None else beside.needle_mm,
         errors=errors,
     )
-    return PlanVerdict(report, None if beside is None else beside.report, success)
+    return PlanVerdict(report, None if beside is None else beside.report, success, executed)
 
 
 def _check_same(playback: Playback, trajectory: Trajectory) -> None:

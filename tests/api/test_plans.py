@@ -298,6 +298,26 @@ def test_a_plan_stored_before_psm_m_moved_is_refused_without_a_crash(trained: Se
     assert_problem(trained.http.get(f"/plans/{made['id']}"), 404)
 
 
+def test_a_plan_is_executed_as_the_request_or_the_installation_states(trained: Service):
+    made = plan(trained, GOAL_MM)
+    weak = {"stiffness": [20.0, 20.0, 1000.0, 1.0, 1.0, 1.0], "velocities": False}
+    played = {}
+    for name, servo in (("none", None), ("sound", {"gravity_compensated": True}), ("weak", weak)):
+        asked = trained.client.play(made["id"], servo=servo)
+        [job] = [one for one in trained.work() if one["id"] == asked["id"]]
+        assert job["state"] == "succeeded", job["error"]
+        played[name] = trained.client.playback(job["result"]["playback"])
+    assert played["none"]["report"]["executed"] is None and "Not executed" in played["none"]["headline"]["text"]
+    sound, refused = played["sound"]["report"]["executed"], played["weak"]["report"]
+    assert sound["failure"] is None and sound["servo"]["gravity_compensated"] and sound["worst_mm"][0] < 1.0
+    assert "Not validated on hardware" in played["sound"]["headline"]["text"]
+    assert played["sound"]["feasible"] and not played["weak"]["feasible"]
+    assert refused["failure"] == refused["executed"]["failure"] and refused["executed"]["surely"]
+    assert "As executed." in played["weak"]["headline"]["text"]
+    for wrong in ({"velocitys": False}, {"delay_s": -1.0}, {"stiffness": [1.0]}):
+        assert_problem(trained.http.post("/playbacks", json={"plan": made["id"], "servo": wrong}), 422)
+
+
 def test_a_plan_is_played_in_the_simulator_and_found_feasible(trained: Service):
     made = plan(trained, GOAL_MM)
     answer = trained.http.post("/playbacks", json={"plan": made["id"]})

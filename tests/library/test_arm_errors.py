@@ -3,7 +3,7 @@
 import io
 import json
 import zipfile
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.errors import BadInput, BadRecording, NoUsableTopic
+from skills.dynamics import Servo
+from skills.errors import BadInput, BadRecording, BadSettings, NoUsableTopic
 from skills.formats import bag_writer as messages
 from skills.formats.bag_writer import Message, write_messages
 from skills.kinematics import forward, quaternion_of
-from skills.library.plans.arm_errors import read_measured, stated_errors
+from skills.library.plans.arm_errors import read_measured, stated_errors, stated_servo
 from skills.verification.arm_calibration import MeasuredArm, calibrate_arm
 from skills.verification.arm_errors import SIZES, UNCALIBRATED
 from skills.verification.arm_slip import measure_slip
@@ -195,3 +196,30 @@ def test_the_command_writes_errors_that_a_playback_takes(tmp_path: Path):
     few = CliRunner().invoke(app, ["calibrate-arm", str(table(tmp_path / "few.csv"))])
     assert few.exit_code == 1
     assert CliRunner().invoke(app, ["calibrate-arm", str(tmp_path / "none.bag")]).exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "JSON"),
+        ('{"velocitys": true}', "velocitys"),
+        ('{"play": [[0, 0]]}', "play"),
+        ('{"most_mm": 0}', "most_mm"),
+    ],
+)
+def test_a_servo_that_is_no_servo_is_refused(text, words):
+    with pytest.raises(BadSettings, match=words):
+        stated_servo(text)
+
+
+def test_the_servo_of_the_page_is_one():
+    page = (Path(__file__).parents[2] / "docs/execution.md").read_text()
+    stated = stated_servo(page.partition("```json\n")[2].partition("```")[0])
+    assert stated == Servo(velocities=False, gravity_compensated=True, most_mm=1.0)
+    for name in (field.name for field in fields(Servo) if field.name != "step_s"):
+        assert f"`{name}`" in page
+
+
+def test_a_servo_is_stated_or_not():
+    assert stated_servo("") is None
+    assert stated_servo('{"velocities": false, "most_mm": 1.5}') == Servo(velocities=False, most_mm=1.5)

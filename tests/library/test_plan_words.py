@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from skills.dynamics import NOT_VALIDATED, Servo
 from skills.gridworld.scene import Scene, Tissue
 from skills.library.plans.description import describe_motion
 from skills.library.plans.headline import CHECK_VERSION, costs_most, headline
@@ -13,6 +14,8 @@ from skills.schemas import plans as schemas
 from skills.schemas.plans import PlanDescription, PlanScene, Timetable
 from skills.schemas.playbacks import Headline
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, ArmErrors
+from skills.verification.execution import ExecutionReport
+from skills.verification.gates import Failure
 from skills.verification.monte_carlo import estimate_success
 from skills.verification.probabilities import JUDGE_VERSION, Cost, EstimateSettings, Faults, SuccessEstimate
 from tests.library.verdicts import doubted, of_pass, probability
@@ -41,6 +44,7 @@ def shown(scene: Scene, learnt: str | None = None, *differs: str) -> PlanScene:
 
 def line_of(of: PlanDescription, doubt: SuccessEstimate, errors: ArmErrors = CALIBRATED, **more: Any) -> Headline:
     stored = {"check_version": CHECK_VERSION, "stated_by": "installation", "feasible": True, "estimate": doubt}
+    stored["executed"] = None
     report: Any = SimpleNamespace(**stored | {"failure_sentence": "Pass 0, A1, sample 3: no."} | more)
     return headline(of, report, errors=errors, lower_bound=0.95)
 
@@ -83,12 +87,27 @@ def test_a_plan_and_its_verdict_say_which_scene_was_checked(scene: PlanScene | N
     assert words in told(of, 0.98).text
 
 
+def test_an_executed_motion_is_in_the_headline_with_what_it_is_worth():
+    failure = Failure(3, 0, 1, 0.03, "effort", 1.0, 0.95, "of its limit", 1.0, 0.03)
+    figures = (Servo(), 0.4, (0.9, 0.5, 1.2), 1.0, (1.0, 0.1, 2.0), 0.5, {})
+    whole, passes = probability(990, lower=0.98), of_pass(faults=JUDGED)
+    for failing, level in ((None, "good"), (failure, "caution")):
+        found = ExecutionReport(*figures, failing, False, ("The tip is predicted 0.40 mm off.", NOT_VALIDATED))
+        line = line_of(FULL, doubted(whole, passes, errors=CALIBRATED), executed=found)
+        assert line.level == level
+        assert line.executed in line.text
+        assert line.executed.startswith("The tip is predicted 0.40 mm off.") and line.executed.endswith(NOT_VALIDATED)
+        assert ("At an end of the ranges: Pass 0, A1, sample 3" in line.executed) == (failing is not None)
+
+
 def test_a_plan_that_hands_over_and_succeeds_surely_is_good():
     line = told(FULL, 0.98)
     assert (line.level, line.word) == ("good", "Likely to succeed")
     assert "in 990 of 1000 worlds: 99.0 % (98.0 % to 100.0 %, 95 %)" in line.text
     assert "with the errors of a calibrated arm the complete plan" in line.text
     assert line.costs_most in line.text
+    assert line.executed == "Not executed: nobody states how the arm is driven (docs/execution.md)."
+    assert line.executed in line.text
     assert line.costs_most == "Most is lost by the rotation of PSM_M's base: without it 99.4 % of the worlds succeed."
 
 

@@ -63,6 +63,7 @@ def verdict_on(of_plan: str, motion: Trajectory, measured: Playback, **chosen: A
         "frame": "PSM2_base",
         "scene": None,
         "tissue": "judged",
+        "executed": None,
         "stated_by": "installation",
         "check_version": CHECK_VERSION,
     }

@@ -7,25 +7,28 @@ import pytest
 from scipy.spatial import cKDTree
 
 from skills.dynamics import NOT_VALIDATED, Servo, predict
-from skills.gridworld.scene import Box, Scene
+from skills.gridworld.scene import Box, Scene, Tissue
 from skills.kinematics import forward
-from skills.verification.execution import Execution, execution_of
+from skills.verification.bodies import bodies_clearance
+from skills.verification.execution import Execution, PlannedMotion, execution_of
 from skills.verification.gates import SCENE, TIP_WAYS, Limits, first_executed_failure
+from skills.verification.intent import compare
 from skills.verification.requested import requested_motion
 from skills.verification.scene_clearance import clearance_of, limit_of
 from tests.verification.hands import Planned, sound_plans
 from tests.verification.test_intent import passes_all_else, refused
 
 CALIBRATED = Servo(gravity_compensated=True)
-WIDE = tuple(np.radians([0.0, 0.0, 0.0, 30.0, 30.0, 30.0]).tolist())
+WIDE = tuple(np.radians([0.0, 0.0, 0.0, 10.0, 10.0, 10.0]).tolist())
 BY_PATH = {
-    "gains of a sixteenth": Servo(stiffness=tuple(one / 16 for one in Servo().stiffness)),
-    "gains of a twelfth, no velocities": Servo(
-        velocities=False, rate_hz=50.0, stiffness=tuple(one / 12 for one in Servo().stiffness)
+    "gains of a fifth": Servo(stiffness=tuple(one / 5 for one in Servo().stiffness)),
+    "gains of a quarter, no velocities": Servo(
+        velocities=False, rate_hz=50.0, stiffness=tuple(one / 4 for one in Servo().stiffness)
     ),
-    "setpoints late by 0.8 s": replace(CALIBRATED, delay_s=0.8),
-    "a play of 60 degrees": replace(CALIBRATED, play=(WIDE, WIDE)),
+    "setpoints late by 0.25 s": replace(CALIBRATED, delay_s=0.25),
+    "a play of 20 degrees": replace(CALIBRATED, play=(WIDE, WIDE)),
 }
+BY_ITSELF = ("error of the tip", "error of the jaws' rotation")  # that the laboratory allows
 HINGE_RADIUS_MM = 3.6  # of the wrist, whose axis ends there
 NO_VELOCITIES = Servo(velocities=False)
 
@@ -42,7 +45,7 @@ def sound(seed: int, count: int) -> list[Planned]:
 
 
 def executed(one: Planned, servo: Servo, scene: Scene | None = None) -> Execution:
-    return execution_of(one.trajectory, servo, request=requested_motion(one.plan, *one[:2]), scene=scene)
+    return execution_of(one.trajectory, servo, PlannedMotion(requested_motion(one.plan, *one[:2]), scene))
 
 
 def off_way_mm(one: Planned, joints: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -89,8 +92,8 @@ def calibrated_refused(count: int) -> list[tuple[int, str]]:
 def leaving(count: int) -> tuple[list[str], list[str]]:
     """Execute plans by a bad servo, and with usual gains past an obstacle that the plan just passes.
 
-    A bad servo counts where the tip is a cell from all planned places, or two from that of the moment, as when late; an
-    obstacle where the jaws' hinge is too near it.
+    A bad servo counts where the tip is half a cell from all planned places, 3 mm from that of the moment, or the jaws
+    are turned by 6.1 degrees; an obstacle where the jaws' hinge is too near it.
 
     Returns:
         The causes, one for each plan, and those that are not named.
@@ -106,12 +109,12 @@ def leaving(count: int) -> tuple[list[str], list[str]]:
             scene = box_beyond(one, planned, there) if apart_mm > 0.3 else None
             if scene is None or hinge_mm(motion.executed.joints, one, scene) >= HINGE_RADIUS_MM + limit_of(scene):
                 continue
-        elif apart_mm < cell_mm and motion.off_mm.max() < 2 * cell_mm:
+        elif apart_mm < cell_mm / 2 and motion.off_mm.max() < 3.0 and motion.off_deg.max() < 6.1:
             continue
         answer = executed(one, servo, scene)
         found.append(name)
         quantity = None if answer.failure is None else answer.failure.quantity
-        if not (answer.surely and quantity in (SCENE, *TIP_WAYS)):
+        if not (answer.surely and quantity in (SCENE, *TIP_WAYS, *BY_ITSELF)):
             missed.append(f"{len(found)}, {name}, {apart_mm:.1f} mm, cells of {cell_mm} mm: {answer.failure}")
         if len(found) == count:
             break
@@ -173,9 +176,57 @@ def test_the_dominating_cause_moves_the_tip_most(plan: Planned):
 
 
 def test_a_failure_has_the_sentence_of_the_gates(plan: Planned):
-    found = executed(plan, BY_PATH["gains of a sixteenth"])
+    found = executed(plan, BY_PATH["gains of a fifth"])
     assert found.failure is not None and found.surely
     assert f"Executed: {found.failure}" in found.reasons
+
+
+def test_what_is_known_of_the_plan_hides_no_failure():
+    """Bounds decide where they can; with nothing known all is computed anew."""
+    decided = 0
+    for one in sound(41, 3):
+        below = (0.0, 0.0, one.trajectory.tip_mm[:, 2].min() - 15.0)
+        request = requested_motion(one.plan, *one[:2])
+        scene = Scene(one.plan.frame, tissue=Tissue.plane(below, (0.0, 0.0, 1.0)))
+        outer, beside = bodies_clearance(one.trajectory, 2.0).report.at_least_mm, clearance_of(one.trajectory, scene)
+        known = PlannedMotion(request, scene, None, compare(request, one.trajectory), beside, outer)
+        for servo in (CALIBRATED, NO_VELOCITIES, *BY_PATH.values()):
+            quick = execution_of(one.trajectory, servo, known)
+            whole = execution_of(one.trajectory, servo, PlannedMotion(request, scene))
+            assert (str(quick.failure), quick.surely) == (str(whole.failure), whole.surely)
+            decided += quick.failure is None
+    assert decided
+
+
+def test_a_laboratorys_own_limits_are_gates(plan: Planned):
+    found = executed(plan, CALIBRATED)
+    assert found.failure is None
+    worst_mm, worst_deg, effort = (
+        found.predicted.off_mm[2].max(),
+        found.predicted.off_deg[2].max(),
+        found.report(plan.trajectory, CALIBRATED).effort,
+    )
+    for limits, quantity in (
+        ({"most_mm": worst_mm * 0.99}, "error of the tip"),
+        ({"most_deg": worst_deg * 0.99}, "error of the jaws' rotation"),
+        ({"most_effort": 0.99 * effort}, "effort"),
+    ):
+        refused_by = executed(plan, replace(CALIBRATED, **limits)).failure
+        assert refused_by is not None and refused_by.quantity == quantity
+    assert executed(plan, replace(CALIBRATED, most_mm=1.01 * worst_mm, most_effort=1.01 * effort)).failure is None
+
+
+def test_a_needle_that_is_caught_as_planned_and_missed_as_executed(plan: Planned):
+    """Loose wrists turn the needle by more than the 15 degrees at which it is held; half of that is no failure."""
+    only = PlannedMotion(approach_m=plan.plan.psm_m.approach)
+    for wide_deg, missed in ((20.0, False), (70.0, True)):
+        play = (0.0, 0.0, 0.0, *[float(np.radians(wide_deg / 2))] * 3)
+        loose = replace(CALIBRATED, play=(play, play), most_mm=100.0, most_deg=180.0)
+        failure = execution_of(plan.trajectory, loose, only).failure
+        assert (failure is not None) == missed
+        if failure is not None:
+            assert (failure.quantity, failure.value) == ("needles that PSM_M misses", 1.0)
+            assert failure.sample in plan.trajectory.last_samples
 
 
 @pytest.mark.parametrize(

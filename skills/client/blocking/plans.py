@@ -16,6 +16,7 @@ from skills.keywords import PlanKeywords, ReachKeywords
 from skills.remedies import did_you_mean
 
 if TYPE_CHECKING:
+    from skills.dynamics import Servo
     from skills.schemas.operation import Job
     from skills.schemas.plans import Plan, PlanSummary, SegmentIndex, SuturePointIn, Trajectory
     from skills.schemas.playbacks import ArmErrorsIn, Comparison, Playback
@@ -124,7 +125,10 @@ class Plans(Connection):
         )
 
     def play(
-        self, plan: str, errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | Mapping[str, Any] | None = None
+        self,
+        plan: str,
+        errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | Mapping[str, Any] | None = None,
+        servo: Servo | Mapping[str, Any] | None = None,
     ) -> Job:
         """Request the playback of a plan in the simulator; the job's result is a `PlaybackResult`.
 
@@ -132,8 +136,10 @@ class Plans(Connection):
             plan: The plan's digest.
             errors: The errors of the arms that are to play it: a default, or the laboratory's own as
                 `skills calibrate-arm` writes them; default: those that the installation states.
+            servo: How PSM_A is driven (docs/execution.md); default: as the installation states.
         """
-        return self._ask(schemas.operation.Job, "POST", "/playbacks", {"plan": plan, "errors": errors})
+        asked = {"plan": plan, "errors": errors, "servo": servo}
+        return self._ask(schemas.operation.Job, "POST", "/playbacks", asked)
 
     def playback(self, playback: str) -> Playback:
         """Return the simulator's verdict."""

@@ -1,6 +1,7 @@
 """A laboratory's own errors: as it states them, and from setpoints and measured poses of a recording or a table.
 
     name or JSON --stated_errors--> ArmErrors
+    JSON --stated_servo--> Servo: how the arms are driven
     recording or table --read_measured--> Measured --calibrate_arm--> ArmCalibration
 
 A *recording* needs `measured_cp` and `setpoint_cp` of the arm in one frame. Each measured pose is compared with the
@@ -18,8 +19,10 @@ from pathlib import Path
 from typing import BinaryIO, get_args
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from skills.arrays import Floats, Ints
+from skills.dynamics import Servo
 from skills.errors import BadInput, BadRecording, BadSettings
 from skills.formats import SUFFIXES, media_type_of, read_recording
 from skills.formats.cells import TableLayout, header_of, open_text, read_numbers
@@ -52,6 +55,21 @@ def stated_errors(stated: str) -> ArmErrors:
             f"The errors of an arm are {' or '.join(NAMED)}, or JSON with name, {', '.join(SIZES)} and sources."
         ) from None
     return checked_own(own)
+
+
+def stated_servo(stated: str) -> Servo | None:
+    """Return how a laboratory drives its arms, from JSON; None where the text is empty.
+
+    Raises:
+        BadSettings: It is no JSON, has a field that no servo has, or a number that is impossible.
+    """
+    try:
+        return TypeAdapter(Servo).validate_json(stated) if stated.strip() else None
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise BadSettings(
+            f"A servo's {'.'.join(map(str, first['loc'])) or 'JSON'}: {first['msg']} (docs/execution.md)."
+        ) from None
 
 
 def read_measured(

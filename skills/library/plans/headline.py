@@ -7,11 +7,13 @@ stated errors of the arms.
 
 from typing import NamedTuple
 
+from skills.dynamics import NOT_VALIDATED
 from skills.errors import Conflict
 from skills.library.plans.description import describe_motion
 from skills.schemas.plans import PlanDescription
 from skills.schemas.playbacks import CountedEvent, Headline, Level, Verdict
 from skills.verification.arm_errors import CALLED, NAMED, ArmErrors
+from skills.verification.execution import ExecutionReport
 from skills.verification.probabilities import JUDGE_VERSION, EstimateUnder, Probability
 from skills.verification.probabilities import NEEDLE as NEEDLE_ERROR
 
@@ -39,14 +41,14 @@ def headline(plan: PlanDescription, report: Verdict, *, errors: ArmErrors, lower
         lower_bound: The value that the lower bound of the entire plan's probability has to reach for the level `good`.
     """
     said = _Estimated() if not report.feasible else _estimated(plan, report, errors)
-    level = _level(plan, report.feasible, said.probability, lower_bound)
-    word = _word(plan, report.feasible, level)
+    level = _level(plan, report, said.probability, lower_bound)
+    word, executed = _word(plan, report.feasible, level), describe_execution(report.executed)
     if not report.feasible:
         verdict = str(report.failure_sentence)
     elif said.estimate is None:
-        verdict = f"feasible in an exact simulation. {said.unjudged}"
+        verdict = f"feasible in an exact simulation. {executed} {said.unjudged}"
     else:
-        found = [f"feasible in an exact simulation; {said.estimate}", said.costs_most, said.hand_over]
+        found = [f"feasible in an exact simulation; {said.estimate}", executed, said.costs_most, said.hand_over]
         verdict = " ".join(filter(None, found))
     return Headline(
         level=level,
@@ -61,7 +63,16 @@ def headline(plan: PlanDescription, report: Verdict, *, errors: ArmErrors, lower
         not_judged=[*said.not_judged],
         costs_most=said.costs_most,
         hand_over=said.hand_over,
+        executed=executed,
     )
+
+
+def describe_execution(executed: ExecutionReport | None) -> str:
+    """Return the sentences on the motion that PSM_A is predicted to execute, or that it was not executed."""
+    if executed is None:
+        return "Not executed: nobody states how the arm is driven (docs/execution.md)."
+    ends = [] if executed.failure is None or executed.surely else [f"At an end of the ranges: {executed.failure}"]
+    return " ".join([executed.reasons[0], *ends, NOT_VALIDATED])
 
 
 class _Estimated(NamedTuple):
@@ -149,10 +160,11 @@ def describe_error(error: str) -> str:
     return "the needle's angle in PSM_A's jaws" if error == NEEDLE_ERROR else CALLED[error]
 
 
-def _level(plan: PlanDescription, feasible: bool, whole: Probability | None, lower_bound: float) -> Level:
-    if not feasible or (whole is not None and whole.upper < MORE_OFTEN_NOT):
+def _level(plan: PlanDescription, report: Verdict, whole: Probability | None, lower_bound: float) -> Level:
+    if not report.feasible or (whole is not None and whole.upper < MORE_OFTEN_NOT):
         return "bad"
-    sure = whole is not None and whole.lower >= lower_bound
+    within = report.executed is None or report.executed.failure is None
+    sure = whole is not None and whole.lower >= lower_bound and within
     return "good" if sure and plan.psm_m_moves else "caution"
 
 

@@ -15,10 +15,11 @@ from skills.db.models import StoredPlayback
 from skills.db.packed import digest
 from skills.db.service_tables import record_event
 from skills.db.session import Database
+from skills.dynamics import Servo
 from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest, learnt, planned
 from skills.library.operation.jobs import JobRequest, RequestedJob, Store
-from skills.library.plans.arm_errors import stated_errors
+from skills.library.plans.arm_errors import stated_errors, stated_servo
 from skills.library.plans.headline import CHECK_VERSION, headline
 from skills.library.plans.plans import check_frame, find_plan, hand_of, trajectory_of
 from skills.library.plans.playback_pictures import can_draw, request_pictures
@@ -33,7 +34,7 @@ from skills.verification.verdict import judge_plan
 
 
 class PlaybackRequest(JobRequest):
-    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under."""
+    """The request of a playback's job: the plan's digest, and the stated errors of the arms and servo of PSM_A."""
 
     kind: ClassVar[str] = "playback"
 
@@ -41,10 +42,16 @@ class PlaybackRequest(JobRequest):
     check_version: int
     errors: ArmErrors
     stated_by: Literal["request", "installation"]
+    servo: Servo | None = None
 
 
 def request_playback(
-    session: Session, plan_sha256: str, actor: str, settings: Settings, errors: ArmErrors | None = None
+    session: Session,
+    plan_sha256: str,
+    actor: str,
+    settings: Settings,
+    errors: ArmErrors | None = None,
+    servo: Servo | None = None,
 ) -> RequestedJob:
     """Queue the playback of a plan in the simulator.
 
@@ -54,6 +61,7 @@ def request_playback(
         actor: The caller's name.
         settings: The installation's settings.
         errors: The errors of the arms that are to play it; None: those that the installation states.
+        servo: How PSM_A is driven; None: as the installation states.
 
     Raises:
         BadPlan: Its frame is not the arm's base, so the simulator would place it wrongly.
@@ -62,16 +70,19 @@ def request_playback(
     plan = find_plan(session, plan_sha256)
     versions.followable(plan.policy)
     check_frame(plan.about.frame)
-    request = playback_request(plan.sha256, settings, errors)
+    request = playback_request(plan.sha256, settings, errors, servo)
     return jobs.ask(session, request, plan.policy.surgeon, actor)
 
 
-def playback_request(plan_sha256: str, settings: Settings, errors: ArmErrors | None) -> PlaybackRequest:
+def playback_request(
+    plan_sha256: str, settings: Settings, errors: ArmErrors | None, servo: Servo | None = None
+) -> PlaybackRequest:
     """Return the request of a playback's job, all defaults resolved; the arguments are those of `request_playback`."""
     return PlaybackRequest(
         plan=plan_sha256,
         check_version=CHECK_VERSION,
         errors=stated_errors(settings.arm_errors) if errors is None else errors,
+        servo=stated_servo(settings.servo) if servo is None else servo,
         stated_by="installation" if errors is None else "request",
     )
 
@@ -90,7 +101,9 @@ def check_playback(database: Database, request: PlaybackRequest, settings: Setti
     check_frame(plan.frame)
     trajectory = trajectory_of(plan)
     measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
-    verdict = judge_plan(plan, trajectory, measured, policy=followed, demo=demo, errors=request.errors)
+    verdict = judge_plan(
+        plan, trajectory, measured, policy=followed, demo=demo, errors=request.errors, servo=request.servo
+    )
     report = finite(
         Verdict(
             **vars(verdict.report),
@@ -99,6 +112,7 @@ def check_playback(database: Database, request: PlaybackRequest, settings: Setti
             check_version=request.check_version,
             failure_sentence=verdict.failure_sentence,
             scene=verdict.scene,
+            executed=verdict.executed,
             tissue="not given" if plan.scene is None or plan.scene.tissue is None else "judged",
             plan=request.plan,
             trajectory=digest(trajectory),

@@ -30,18 +30,20 @@ class ReplayConditions:
         lower_bound: The least probability, by its lower bound, with which every pass has to succeed.
         constant_turn_deg: The angle by which a constant orientation may depart from the recorded one.
         handoff: "none" accepts a plan without a hand-off.
+        executed: Whether the verdict has to predict the executed motion: the installation states how PSM_A is driven.
     """
 
     errors: ArmErrors
     lower_bound: float
     constant_turn_deg: float = CONSTANT_TURN_DEG
     handoff: Literal["none"] | None = None
+    executed: bool = False
 
     @classmethod
     def of(cls, settings: Settings, handoff: Literal["none"] | None = None) -> "ReplayConditions":
         """Return those of an installation's settings."""
         errors = stated_errors(settings.arm_errors)
-        return cls(errors, settings.replay_lower_bound, settings.constant_turn_deg, handoff)
+        return cls(errors, settings.replay_lower_bound, settings.constant_turn_deg, handoff, bool(settings.servo))
 
 
 def cleared(session: Session, row: Plan, plan: SuturePlan, conditions: ReplayConditions) -> StoredPlayback:
@@ -87,6 +89,8 @@ def cleared(session: Session, row: Plan, plan: SuturePlan, conditions: ReplayCon
         raise Corrupt("A stored verdict does not match its digest; restore it from a backup.")
     if not (played.feasible and played.report.feasible):
         raise Conflict(f"The simulator found this plan infeasible: {played.report.failure_sentence} Change the plan.")
+    if conditions.executed and played.report.executed is None:
+        raise Conflict("This plan was judged before it was stated how the arm is driven. Play it again.")
     check_probability(played.report, errors=conditions.errors, lower_bound=conditions.lower_bound)
     return played
 
