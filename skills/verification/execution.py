@@ -17,6 +17,7 @@ from skills.dynamics import NOT_VALIDATED, Executed, Prediction, Servo, levers_m
 from skills.fields import Figure, schema
 from skills.gridworld.scene import Scene
 from skills.kinematics import INSERTION, JOINTS, forward, instrument_of, quaternion_of
+from skills.notebook import card
 from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM
 from skills.planning.trajectory import Trajectory
 from skills.verification.bodies import bodies_clearance
@@ -107,6 +108,11 @@ class ExecutionReport:
     failure: Failure | None
     surely: bool
     reasons: tuple[str, ...]
+
+    def _repr_html_(self) -> str:
+        first, *more, worth = self.reasons
+        facts = {"error": first, "causes, remedies and limits": " ".join(more), "worth": worth}
+        return card("As PSM_A is predicted to execute it", facts)
 
 
 @dataclass(frozen=True, eq=False)

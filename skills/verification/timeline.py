@@ -18,7 +18,7 @@ The arms' outer bodies are sent at fewer times, because they are large and slow 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -29,8 +29,9 @@ from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo, partner_motion
 from skills.demonstration.movement import press_times, same_signs, smoothed_speed
 from skills.demonstration.recording import Motion, Recording
+from skills.dynamics import Servo, predict
 from skills.fields import Column, Count, schema
-from skills.kinematics import INSTRUMENTS, matrix_of, quaternion_of
+from skills.kinematics import INSTRUMENTS, JOINTS, forward, matrix_of, quaternion_of
 from skills.planning.motion_laws import PHASES
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
 from skills.verification.bodies import Parts, between, names_of, parts_of, radii_of
@@ -90,6 +91,8 @@ class ArmTrack:
         bodies: Names of the outer bodies and of the shaft; empty if joints, instrument or base are not known.
         radii_mm: Their radii.
         bodies_mm: Both ends of the axis of each: 6 numbers a body, the bodies of every `every`-th row.
+        off_mm: The greatest distance at which the tip is predicted to be as the arm executes this motion, which is the
+            radius of a tube around it; null if it was not executed.
     """
 
     arm: str
@@ -103,6 +106,7 @@ class ArmTrack:
     bodies: tuple[str, ...]
     radii_mm: tuple[float, ...]
     bodies_mm: Column | None
+    off_mm: Column | None = None
 
     def __post_init__(self) -> None:
         for name, row in (
@@ -406,6 +410,7 @@ def timeline_of_plan(
     played: Playback | None = None,
     odds: Mapping[int, float] | None = None,
     event: str = "",
+    servo: Servo | None = None,
 ) -> Timeline:
     """Return a plan's motion in the base frame of PSM_A.
 
@@ -416,6 +421,7 @@ def timeline_of_plan(
         played: The newest playback, of which the distances are shown; None if there is none.
         odds: For each pass the probability of an event; None: none is shown.
         event: That event in words.
+        servo: How PSM_A is driven, whose predicted motion is shown as one more arm; None: it is not shown.
     """
     t, at_s = trajectory, trajectory.stamps_s
     clock = _Clock.of(float(at_s[0]), float(at_s[-1]), t.rate_hz)
@@ -426,13 +432,23 @@ def timeline_of_plan(
         pose = at_s, poses.tip_mm, quaternion_of(poses.rotation)
         shown = None if jaw is None else (at_s, jaw)
         arms.append(clock.track(name, frame, pose, shown, (at_s, one.joints), one.instrument, base))
+    efforts = []
+    if servo is not None:
+        found = predict(t.joints, at_s, servo, t.instrument)
+        tip_mm, turned = forward(found.executed.joints, t.instrument)
+        joints = at_s, found.executed.joints
+        executed = clock.track(f"{PSM_A} as executed", frame, (at_s, tip_mm, quaternion_of(turned)), None, joints)
+        arms = [(replace(arms[0][0], off_mm=_column(clock.column(at_s, found.off_mm[2]))), arms[0][1]), *arms[1:]]
+        arms.append(executed)
+        for joint, values in zip(JOINTS, 100 * found.effort.T, strict=True):
+            efforts.append(Trace(f"Effort of {joint}", "% of its limit", None, _column(clock.column(at_s, values))))
     return clock.timeline(
         "plan",
         arms,
         in_one_frame=True,
         clutch_s=(),
         stages=_stages(t),
-        traces=(*_distances(clock, t, played), *_odds(clock, t, odds or {}, event)),
+        traces=(*_distances(clock, t, played), *_odds(clock, t, odds or {}, event), *efforts),
     )
 
 

@@ -119,6 +119,24 @@ def test_two_surgeons_are_in_step_by_time_or_by_their_way(browser: Browser, serv
     close(tab)
 
 
+def test_an_executed_plan_has_its_tube_and_efforts(browser: Browser, service: Service, client: Client) -> None:
+    sample = SAMPLES["kestrel"]
+    client.put_surgeon(sample.surgeon)
+    start_s, end_s = sample.segments[0]
+    client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture, start_s=start_s, end_s=end_s)
+    client.wait(client.train(sample.surgeon, sample.suture, release=True), timeout_s=END_S)
+    plan = client.plan(sample.surgeon, sample.suture, [(5.0, 55.0, -120.0)], handoff="none")
+    client.wait(client.play(plan.id, servo={"velocities": False}), timeout_s=END_S)
+    tab = Watched(browser, service.url)
+    page = when_ready(tab, f"/pages/player/plans/{plan.id}")
+    expect(page.get_by_role("checkbox", name="Predicted error of the tip")).to_be_checked()
+    expect(page.locator("#now")).to_contain_text("as executed")
+    expect(page.locator("#now")).to_contain_text("Effort of yaw")
+    expect(page.locator("#charts")).to_contain_text("Efforts as executed")
+    tab.shoot("player-executed")
+    close(tab)
+
+
 def test_a_sign_of_loading_stands_until_the_motion_is_there(browser: Browser, service: Service, player: str) -> None:
     tab = Watched(browser, service.url, view=False)
     held = []

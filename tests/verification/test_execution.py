@@ -164,6 +164,8 @@ def test_the_answer_says_what_is_off_why_and_what_helps(plan: Planned):
     assert "compensate gravity." in words and "send velocities." in words and "% of its limit" in words
     assert f"With gravity compensated the mean error is {bare.remedies_mm['gravity compensated']:.2f} mm" in words
     assert bare.reasons[-1] == NOT_VALIDATED and "Not validated on hardware" in words
+    html = bare.report(plan.trajectory, NO_VELOCITIES)._repr_html_()
+    assert "compensate gravity." in html and NOT_VALIDATED in html
     helped = "\n".join(executed(plan, CALIBRATED).reasons)
     assert "compensate gravity" not in helped and "send velocities" not in helped
 

@@ -10,8 +10,9 @@ from pydantic import TypeAdapter
 
 from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.recording import Motion, Recording, Signal
+from skills.dynamics import Servo, predict
 from skills.fields import as_json
-from skills.kinematics import forward, matrix_of
+from skills.kinematics import JOINTS, forward, matrix_of
 from skills.learning.pose_style import PosePath
 from skills.planning.passes import PassPath
 from skills.planning.trajectory import Trajectory, time_parametrise
@@ -139,6 +140,21 @@ def planned() -> Trajectory:
     down = matrix_of(np.array([[np.sqrt(0.5), np.sqrt(0.5), 0, 0]]))[0]
     passes = [PassPath(np.array([[x, 30.0, -130.0], [x + 5, 50.0, -115.0]]), down) for x in (-20.0, 0.0)]
     return time_parametrise(passes)
+
+
+def test_an_executed_plan_has_one_more_arm_a_tube_and_efforts():
+    t, servo = planned(), Servo(velocities=False)
+    timeline = timeline_of_plan(t, arm="PSM2", frame="PSM2_base", servo=servo)
+    found, (asked, executed) = predict(t.joints, t.stamps_s, servo, t.instrument), timeline.arms
+    tip_mm = forward(found.executed.joints, t.instrument)[0]
+    at_s = timeline.seconds()
+    for wanted, got in ((tip_mm, executed.tip_mm), (found.off_mm[2][:, None], asked.off_mm[:, None])):
+        seen = np.stack([np.interp(at_s, t.stamps_s, one) for one in wanted.T], axis=1)
+        assert np.abs(got - seen).max() < 1e-4
+    assert executed.arm == "PSM_A as executed" and executed.off_mm is None and asked.off_mm.max() > 0.5
+    assert [one.name for one in timeline.traces] == [f"Effort of {joint}" for joint in JOINTS]
+    most = max(float(one.values.max()) for one in timeline.traces)
+    assert most == pytest.approx(100 * found.effort.max(), rel=0.02)
 
 
 def test_a_plan_names_its_phases_and_a_pass_its_probability():

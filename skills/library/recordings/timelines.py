@@ -62,12 +62,19 @@ def timeline_of(database: Database, source: Source, sha256: str, parse: Parser) 
         motion = planned(plan)
         played = session.scalar(newest(StoredPlayback, StoredPlayback.plan_row == plan.row))
         measured, odds, event = None if played is None else played.measured, {}, ""
+        executed = None if played is None else played.report.executed
         if played is not None and played.feasible:
             under = played.report.estimate.under[0]
             odds = {number: one.succeeds.probability for number, one in enumerate(under.passes)}
             event = f"The pass {OF_A_PASS[counted_as(under)]}, {describe_errors(under.errors.name)}"
     return timeline_of_plan(
-        trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds, event=event
+        trajectory_of(motion),
+        arm=motion.arm,
+        frame=motion.frame,
+        played=measured,
+        odds=odds,
+        event=event,
+        servo=None if executed is None else executed.servo,
     )
 
 

@@ -11,6 +11,7 @@ const marks = JSON.parse(player.dataset.marks); // parts to show, in seconds on 
 const JOINTS = ["yaw", "pitch", "insertion", "roll", "wrist pitch", "wrist yaw"];
 // A colour for each arm, of the first motion and of the second; the second is also drawn dashed.
 const COLOURS = [["path", "learnt"], ["goal", "other"]];
+const OF_ERRORS = ["goal", "reward", "wrong"]; // a third each of the greatest;
 const OF_TRACES = ["path", "learnt", "goal", "other"];
 const TOOL_MM = { radius: 2.2, finger: 1.1, behind: 12 };
 const SEEN_MM = 0.3; // of a path on the screen
@@ -18,6 +19,7 @@ const SEEN_MM = 0.3; // of a path on the screen
 const layers = [
   { id: "trails", name: "Paths of the tips", shape: "line", colour: "path", on: true },
   { id: "tools", name: "Tips and jaws", shape: "body", colour: "path", on: true },
+  { id: "tube", name: "Predicted error of the tip, executed (colour: its size)", shape: "body", colour: "other", on: true },
   { id: "bodies", name: "Outer bodies of the arms", shape: "body", colour: "box", on: false },
   { id: "marks", name: "Start and end", shape: "ends", colour: "goal", on: false },
 ];
@@ -38,7 +40,7 @@ function read({ timeline }) {
   opened.traces = timeline.traces.map((one) => ({ ...one, values: column(one.values) }));
   opened.arms = timeline.arms.map((arm) => {
     const found = { ...arm };
-    for (const name of ["tip_mm", "rotation_xyzw", "jaw_rad", "joints", "speed_mm_s", "bodies_mm"]) found[name] = arm[name] && column(arm[name]);
+    for (const name of ["tip_mm", "rotation_xyzw", "jaw_rad", "joints", "speed_mm_s", "bodies_mm", "off_mm"]) found[name] = arm[name] && column(arm[name]);
     return found;
   });
   opened.duration = (opened.rows - 1) / opened.rate_hz;
@@ -106,6 +108,17 @@ function drawable(tips, shift) {
   return [points.subarray(0, 3 * count), rows];
 }
 
+// The tube in which an executed tip is predicted, a colour for each third of its greatest radius.
+function tube(arm, trail, rows) {
+  const most = arm.off_mm.reduce((a, b) => (b > a ? b : a), 0);
+  const thirds = [[], [], []];
+  rows.slice(1).forEach((row, i) => {
+    const ends = [...trail.slice(3 * i, 3 * i + 6)];
+    if (!ends.some(Number.isNaN)) thirds[Math.min(2, Math.floor((3 * arm.off_mm[row]) / most))].push([ends.slice(0, 3), ends.slice(3), arm.off_mm[row]]);
+  });
+  return thirds.map((mine, i) => bodies(flat(mine), { colour: OF_ERRORS[i], opacity: 0.3 })).filter((_, i) => thirds[i].length);
+}
+
 // The things that stand still, and those that move, of every arm.
 function stage(motions) {
   const [still, moving] = [[], []];
@@ -122,6 +135,7 @@ function stage(motions) {
       still.push({ layer: "marks", thing: dots(trail.slice(first, first + 3), { colour: "start", symbol: "diamond", size: 6, name: `start of ${name}` }) });
       still.push({ layer: "marks", thing: dots(trail.slice(last, last + 3), { colour: "goal", symbol: "cross", size: 6, name: `end of ${name}` }) });
     }
+    if (arm.off_mm) for (const thing of tube(arm, trail, rows)) still.push({ layer: "tube", thing });
     const jaws = bodies(new Float32Array(7), { colour, bounds: true });
     const shaft = bodies(new Float32Array(7), { colour: "box" });
     const arms = bodies(new Float32Array(7), { colour: "box", opacity: 0.35, bounds: true });
@@ -250,19 +264,20 @@ function lines(of, width, k, name, m, a) {
 }
 
 function draws() {
-  const speeds = [], jaws = [], joints = [[], []], distances = [], odds = [];
+  const speeds = [], jaws = [], joints = [[], []], distances = [], odds = [], errors = [], efforts = [];
   motions.forEach((motion, m) => {
     motion.arms.forEach((arm, a) => {
       const name = motions.length > 1 ? `${arm.arm}${m ? " of the second" : ""}` : arm.arm;
       speeds.push(lines(arm.speed_mm_s, 1, 0, name, m, a));
       if (arm.jaw_rad) jaws.push({ ...lines(arm.jaw_rad, 1, 0, name, m, a), scale: 180 / Math.PI });
-      if (arm.joints) JOINTS.forEach((joint, k) => (k === 2 ? joints[1] : joints[0]).push({ ...lines(arm.joints, 6, k, `${name} ${joint}`, m, a), scale: k === 2 ? 1 : 180 / Math.PI, thin: k > 0 }));
+      if (arm.off_mm) errors.push(lines(arm.off_mm, 1, 0, name, m, a));
+      if (arm.joints) JOINTS.forEach((joint, k) => (k === 2 ? joints[1] : joints[0]).push({ ...lines(arm.joints, 6, k, `${name} ${joint}`, m, a), scale: k === 2 ? 1 : 180 / Math.PI, thin: k > 0, key: k === 2 ? null : name }));
     });
-    motion.traces.forEach((trace, i) => (trace.unit ? distances : odds).push({ ...lines(trace.values, 1, 0, `${trace.name}${m ? ", second" : ""}`, m, i), colour: OF_TRACES[i % OF_TRACES.length], limit: trace.limit, scale: trace.unit ? 1 : 100 }));
+    motion.traces.forEach((trace, i) => (trace.unit === "mm" ? distances : trace.unit ? efforts : odds).push({ ...lines(trace.values, 1, 0, `${trace.name}${m ? ", second" : ""}`, m, i), colour: OF_TRACES[i % OF_TRACES.length], limit: trace.limit, scale: trace.unit ? 1 : 100 }));
   });
   return [
     ["Speed of the tips, mm/s", speeds, { zero: true, stages: true }], ["Jaws, °", jaws], ["Distances, mm; dotted: the least that is permitted", distances],
-    ["Share of worlds in which the pass goes well, %", odds, { range: [0, 100] }], ["Joints that turn, °", joints[0]], ["Insertion, mm", joints[1]],
+    ["Share of worlds in which the pass goes well, %", odds, { range: [0, 100] }], ["Greatest predicted error of the tip as executed, mm", errors, { zero: true }], ["Efforts as executed, % of their limits", efforts, { range: [0, 100] }], ["Joints that turn, °", joints[0]], ["Insertion, mm", joints[1]],
   ].filter(([, mine]) => mine.length);
 }
 
@@ -329,6 +344,7 @@ try {
   scene = new Scene(() => (staged ? things(staged) : [])); // its programs are compiled while the motions are read
   motions = (await asked).map(read);
   if (!motions.some((motion) => motion.arms.some((arm) => arm.bodies_mm))) layers.splice(layers.findIndex((one) => one.id === "bodies"), 1);
+  if (!motions.some((motion) => motion.arms.some((arm) => arm.off_mm))) layers.splice(layers.findIndex((one) => one.id === "tube"), 1);
   restage();
   let wide = on("bodies");
   layerList(get("layers"), layers, () => {

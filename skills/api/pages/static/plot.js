@@ -18,7 +18,7 @@ export class Plot {
     for (const line of named) {
       const sign = element("span", { className: "sign" });
       line.sign = sign;
-      this.key.append(element("li", {}, sign, ` ${lines.length > 4 ? line.name.replace(/ (yaw|insertion)$/, "") : line.name}`));
+      this.key.append(element("li", {}, sign, ` ${line.key ?? line.name}`));
     }
     this.frame.addEventListener("pointerdown", (event) => {
       this.frame.setPointerCapture(event.pointerId);
