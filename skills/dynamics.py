@@ -258,6 +258,41 @@ def execute(joints: Floats, stamps_s: Floats, servo: Servo, arm: Floats, instrum
     return Executed(link / _UNITS, effort, droop / _UNITS, (link - plan - droop - stick) / _UNITS, stick / _UNITS)
 
 
+class MovingArm:
+    """An arm that is driven step by step, as a stand-in for one on a bus.
+
+    Attributes:
+        joints: Its links' joints, rad and mm, shape (6,).
+        speeds: Their speeds, per second.
+        efforts: Its motors' efforts, Nm and N.
+    """
+
+    def __init__(self, joints: ArrayLike, servo: Servo, instrument: str = DEFAULT_INSTRUMENT) -> None:
+        """Place an arm, the middle of a servo's ranges, at rest; rate and delay of its setpoints are the bus's own."""
+        self.joints = frozen(joints, np.float64, (6,), "joints")
+        self.speeds, self.efforts = np.zeros(6), np.zeros(6)
+        self._parts = np.concatenate([servo.arm(0.5, 0.5), [instrument_of(instrument).arm.effort]])
+        self._state, self._step_s = np.array([self.joints * _UNITS, np.zeros(6)]), servo.step_s
+
+    def move(self, wanted: Floats, speeds: Floats, seconds: float) -> None:
+        """Move for some seconds under one setpoint.
+
+        Args:
+            wanted: Joints, rad and mm, shape (6,).
+            speeds: Their speeds, per second; 0 where none are sent.
+            seconds: How long, above 0.
+        """
+        plan = np.tile(wanted * _UNITS, (2, 1))
+        waves = np.concatenate([sin(plan[:, :2]), cos(plan[:, :2])], axis=1)
+        motor, link, effort, friction, load = np.zeros((5, 2, 6))
+        link[0] = self.joints * _UNITS
+        stamps, stream = np.array([0.0, seconds]), np.array([self._step_s, 1.0 / seconds, 0.0])
+        parts, state = self._parts, self._state
+        given = np.tile(speeds * _UNITS, (2, 1))
+        _run(stamps, plan, given, waves, _LOADS.copy(), parts, stream, state, motor, link, effort, friction, load)
+        self.joints, self.speeds, self.efforts = link[1] / _UNITS, state[1] / _UNITS, effort[1]
+
+
 @compiled
 def _run(
     stamps: Floats,

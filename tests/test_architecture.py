@@ -99,6 +99,7 @@ def test_the_table_of_rooms_names_each_after_those_that_it_imports():
         ("pybullet_data", "simulation/"),
         ("mujoco", "simulation/referee.py"),
         ("numba", "compiled.py"),
+        ("cyclonedds", "live/dds.py"),
         ("movement_primitives", "report/rivals.py"),
         ("safetensors", ("learning/networks.py", "db/packed.py")),
         ("torch", "deep/"),

@@ -30,7 +30,7 @@ PAGE = (Path(__file__).parent.parent / "docs" / "cli.md").read_text()
 NAME = re.compile(r"skills_[\w-]+|\b[0-9a-f]{8,64}\b")
 MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.]+(?:Z|\+00:00)")
 AS_SHOWN, HOW = doctest.OutputChecker(), doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-NOT_RUN = {"serve", "worker", "report", "try", "recognise"}  # without an end, on another page, or of many trials
+NOT_RUN = {"serve", "worker", "report", "try", "recognise", "arm"}  # without an end, on another page, or of many trials
 
 
 @pytest.fixture

@@ -70,6 +70,7 @@ RUN_BY: dict[str, list[str]] = {
         ELSEWHERE,
     ],
     "library.md": [HERE + "test_the_python_of_the_library_ends_with_a_feasible_playback"],
+    "live.md": 2 * ["tests/live/test_check.py::test_a_stand_in_on_dds_is_checked_from_another_process"],
     "operating.md": 4 * [OPERATING + ALL_COMMANDS]
     + [OPERATING + "test_the_settings_of_the_page_are_those_there_are"]
     + 3 * [OPERATING + "test_the_units_of_the_page_are_units"]

@@ -19,6 +19,7 @@ from skills.cli import (
     demos,
     jobs,
     keys,
+    live,
     operation,
     people,
     plans,
@@ -76,7 +77,7 @@ app = typer.Typer(
     help="Suture styles: learn, certify, serve and check. Research use only.",
 )
 for commands in (  # the order of the commands in `skills --help`
-    *(operation, keys, tries, recordings, demos, trials, datasets, jobs, policies, plans, arms),
+    *(operation, keys, tries, recordings, demos, trials, datasets, jobs, policies, plans, arms, live),
     *(comparison, calibrations, report, people),
 ):
     app.add_typer(commands.commands)

@@ -41,7 +41,7 @@ from skills.formats import topics
 from skills.formats.archive import pack
 from skills.formats.columns import in_metres
 from skills.formats.mcap.reader import NOTES
-from skills.formats.topics import BOOL, FLOAT64, JOINT_STATE, JOY, POSE, STRING
+from skills.formats.topics import BOOL, FLOAT64, JOINT_STATE, JOY, OPERATING_STATE, POSE, STRING
 from skills.verification.timeline import ArmTrack, Timeline
 
 _MESSAGES = files("skills.formats") / "messages"  # ROS's own definitions, with those of nested messages
@@ -83,13 +83,14 @@ def joint_state(
     names: Sequence[str] = (),
     *,
     velocities: Sequence[float] = (),
+    efforts: Sequence[float] = (),
     frame: str = "",
 ) -> Message:
-    """Return a JointState message with positions in rad or m, optional velocities, and no efforts."""
+    """Return a JointState message with positions in rad or m, and optional velocities and efforts (Nm, N)."""
     body = _Body().header(stamp_ns, frame).put("I", len(names))
     for name in names:
         body.text(name)
-    body.numbers("d", positions).numbers("d", velocities).numbers("d", ())
+    body.numbers("d", positions).numbers("d", velocities).numbers("d", efforts)
     return Message(stamp_ns, topic, JOINT_STATE, bytes(body.data))
 
 
@@ -97,6 +98,12 @@ def joy(topic: str, stamp_ns: int, buttons: Sequence[int], *, frame: str = "") -
     """Return a Joy message with a pedal's state: `buttons[0]` is 0 released, 1 pressed, 2 a quick tap."""
     body = _Body().header(stamp_ns, frame).numbers("f", ()).numbers("i", buttons)
     return Message(stamp_ns, topic, JOY, bytes(body.data))
+
+
+def operating_state(topic: str, stamp_ns: int, state: str, is_homed: bool, is_busy: bool) -> Message:
+    """Return crtk_msgs' OperatingState: an arm's state, such as ENABLED."""
+    body = _Body().header(stamp_ns, "").text(state).put("??", is_homed, is_busy)
+    return Message(stamp_ns, topic, OPERATING_STATE, bytes(body.data))
 
 
 def boolean(topic: str, log_ns: int, value: bool) -> Message:

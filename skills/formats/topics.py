@@ -27,6 +27,7 @@ JOY = "sensor_msgs/msg/Joy"
 BOOL = "std_msgs/msg/Bool"
 FLOAT64 = "std_msgs/msg/Float64"
 STRING = "std_msgs/msg/String"
+OPERATING_STATE = "crtk_msgs/msg/OperatingState"
 
 CLUTCH_TOPICS = ("/console/clutch", "/footpedals/clutch")  # the first one present is used
 RELEASED, PRESSED, QUICK_TAP = 0, 1, 2  # buttons[0] of a pedal
