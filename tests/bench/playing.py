@@ -17,6 +17,7 @@ from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import Trajectory, joint_ratios, time_parametrise
 from skills.simulation import player, simulator
 from skills.verification.bodies import bodies_clearance
+from skills.verification.execution import PlannedMotion, execution_of
 from skills.verification.intent import compare
 from skills.verification.playback import CLEARANCE_SEEN_MM
 from skills.verification.requested import requested_motion
@@ -86,12 +87,22 @@ def verdicts(table: Table) -> None:
     def executed(ranged: bool) -> None:
         predict(trajectory.joints, trajectory.stamps_s, Servo(), trajectory.instrument, ranged=ranged)
 
-    alone, one, five, whole, bare = in_turn(
-        closed_form, lambda: executed(False), lambda: executed(True), judged, lambda: plain(asked), rounds=ROUNDS
+    outer, beside = bodies_clearance(trajectory, 2.0).report.at_least_mm, clearance_of(trajectory, scene_mm)
+    known = PlannedMotion(given, scene_mm, None, compare(given, trajectory), beside, outer)
+    servo = Servo(gravity_compensated=True)
+    alone, one, five, answer, whole, bare = in_turn(
+        closed_form,
+        lambda: executed(False),
+        lambda: executed(True),
+        lambda: execution_of(trajectory, servo, known),
+        judged,
+        lambda: plain(asked),
+        rounds=ROUNDS,
     )
     table.add_row(f"verdict without a simulator, {PASSES} passes", f"{alone:.2f} s", f"{len(trajectory)} samples")
     table.add_row("  the executed motion", f"{one:.2f} s", f"with it {1 + one / alone:.2f} of the verdict without")
     table.add_row("  the executed motion with its range", f"{five:.2f} s", f"with it {1 + five / alone:.2f} of that")
+    table.add_row("  with causes, remedies and gates", f"{answer:.2f} s", f"with it {1 + answer / alone:.2f} of that")
     table.add_row("  with a simulator, but for process and picture", f"{whole:.2f} s", "")
     table.add_row("  PyBullet's calls alone", f"{bare:.2f} s", f"the verdict takes {whole / bare:.2f} of it")
 
