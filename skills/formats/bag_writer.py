@@ -83,13 +83,14 @@ def joint_state(
     names: Sequence[str] = (),
     *,
     velocities: Sequence[float] = (),
+    efforts: Sequence[float] = (),
     frame: str = "",
 ) -> Message:
-    """Return a JointState message with positions in rad or m, optional velocities, and no efforts."""
+    """Return a JointState message with positions in rad or m, and optional velocities and efforts."""
     body = _Body().header(stamp_ns, frame).put("I", len(names))
     for name in names:
         body.text(name)
-    body.numbers("d", positions).numbers("d", velocities).numbers("d", ())
+    body.numbers("d", positions).numbers("d", velocities).numbers("d", efforts)
     return Message(stamp_ns, topic, JOINT_STATE, bytes(body.data))
 
 
