@@ -56,7 +56,7 @@ class FittedQuantity:
         no_error: Error if no effort, or no error of the joint, is predicted.
         constant: Error if the mean is predicted.
         written: Whether the servo has the number: the law is possible, the error of the fit the least, and the interval
-            above 0, or for friction, load and compensation cut at 0.
+            above 0, or for friction and load cut at 0.
     """
 
     joint: str
@@ -140,7 +140,7 @@ def _quantities(j: int, names: Sequence[str], terms: Floats, target: Floats, rea
             published = float(factors[k] > 0.5 if name == "compensation" else middle)
             fitted, low, high = (float(f"{factors[k] + side * half[k]:.4g}") for side in (0, -1, 1))
             without = _left_out(terms, target, k, published)
-            sure = possible and (low > 0 or name not in ("inertia", *_GAINS[:2]))
+            sure = possible and (low > 0 or name in _MOTION[1:])
             written = sure and error < min(without, none, mean)
             yield FittedQuantity(JOINTS[j], name, fitted, low, high, published, error, without, none, mean, written)
 

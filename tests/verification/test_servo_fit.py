@@ -1,13 +1,14 @@
 """The fit of a servo: simulated arms are recovered, and a published recording's halves are predicted."""
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from skills.dynamics import Servo, execute, loads
+from skills.dynamics import Servo, execute, loads, predict
 from skills.errors import BadInput
+from skills.kinematics import forward
 from skills.library.plans.arm_errors import read_states
 from skills.verification.servo_fit import FittedQuantity, fit_servo
 from tests.formats.bags import sample_folder
@@ -243,3 +244,31 @@ def test_a_published_arms_gains_are_round_numbers():
     assert [of[joint, "load"].fitted for joint in ("yaw", "pitch")] == pytest.approx([-0.27, 0.13], abs=0.01)
     assert (servo.load[0][0], servo.load[1][0]) == (0.0, 0.0)
     assert of["insertion", "inertia"].high < 0 and servo.coulomb[0][2] == Servo().coulomb[0][2]
+
+
+@pytest.mark.needs("recordings")
+@pytest.mark.parametrize("left_out", [0, 1])
+def test_a_servo_of_one_half_predicts_a_published_arms_other_half(left_out):
+    """Mean error of the tip that the arm executes of its setpoints, in mm: of motion at up to 1 rad/s."""
+    states = read_states(sample_folder() / "calibration" / "pitch_exp_traj_02_test_cropped.bag")
+    halves = np.array_split(np.arange(len(states[0])), 2)
+    known, test = ([one[halves[k]] for one in states] for k in (1 - left_out, left_out))
+    wanted, real = test[2][:, 0] / UNITS, test[1][:, 0] / UNITS
+    off = (known[1][:, 0] - known[2][:, 0]).mean(axis=0) / UNITS
+    still = Servo(velocities=False)
+
+    def off_mm(joints: np.ndarray) -> float:
+        return float(np.linalg.norm(forward(joints)[0] - forward(real)[0], axis=1).mean())
+
+    found = {"no error": off_mm(wanted), "constant error": off_mm(wanted + off)}
+    for name, servo in (
+        ("published", Servo()),
+        ("published, without velocities", still),
+        ("and compensated", replace(still, gravity_compensated=True)),
+        ("fitted", fit_servo(*known)[1]),
+    ):
+        servo = replace(servo, play=((0.0,) * 6,) * 2)  # encoders sit before it
+        found[name] = off_mm(predict(wanted, test[0], servo, ranged=False).executed.joints)
+    print(found)
+    expected = ([3.44, 3.47, 2.93, 1.11, 0.82, 0.60], [3.55, 3.55, 3.32, 1.70, 0.77, 0.64])[left_out]
+    assert list(found.values()) == pytest.approx(expected, abs=0.01)
