@@ -55,8 +55,8 @@ class FittedQuantity:
         as_published: Error with this number as published and the others fitted.
         no_error: Error if no effort, or no error of the joint, is predicted.
         constant: Error if the mean is predicted.
-        written: Whether the servo has the number: the law is possible, the error of the fit the least, and the interval
-            above 0, or for friction and load cut at 0.
+        written: Whether the servo has the number: the law is possible, the error of the fit the least, of the
+            controller's law even half of the last two, and the interval above 0, or for friction and load cut at 0.
     """
 
     joint: str
@@ -134,6 +134,7 @@ def _quantities(j: int, names: Sequence[str], terms: Floats, target: Floats, rea
     factors, half = _solved(terms, target, []), _STUDENT * np.sqrt(BLOCKS - 1) * np.std(parts, axis=0)  # jackknife
     possible = bool((factors + half)[:2].min() >= 0) or names[0] == "compensation"
     error, none, mean = map(_left_out, (terms, terms[:, :0], np.ones((len(real), 1))), (target, real, real))
+    scale = 0.5 if names[0] == "stiffness" else 1.0  # ours: of a controller's effort its law leaves little
     for k, name in enumerate(names):
         if j < 3 or name not in ("load", "compensation"):
             middle = np.mean(np.atleast_2d(getattr(Servo(), name)), axis=0)[j]
@@ -141,7 +142,7 @@ def _quantities(j: int, names: Sequence[str], terms: Floats, target: Floats, rea
             fitted, low, high = (float(f"{factors[k] + side * half[k]:.4g}") for side in (0, -1, 1))
             without = _left_out(terms, target, k, published)
             sure = possible and (low > 0 or name in _MOTION[1:])
-            written = sure and error < min(without, none, mean)
+            written = sure and error < min(without, scale * none, scale * mean)
             yield FittedQuantity(JOINTS[j], name, fitted, low, high, published, error, without, none, mean, written)
 
 

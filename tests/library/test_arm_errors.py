@@ -252,7 +252,13 @@ def test_without_setpoints_or_joints_the_sentence_says_what_to_record(tmp_path: 
     for file in (states_bag(tmp_path / "joints.mcap", made, setpoints=False), bag(tmp_path / "poses.mcap", 50)):
         code, output = ran_servo(file, to)
         assert code == 1 and "ros2 bag record /PSM1/measured_js /PSM1/setpoint_js" in output and not to.exists()
-    two = states_bag(tmp_path / "two.mcap", made)
+    two = states_bag(tmp_path / "without-a-suffix", made)
+    with zipfile.ZipFile(tmp_path / "folder.zip", "w") as out:
+        out.write(two, "bag/bag_0.mcap")
+    (tmp_path / "other.csv").write_text("time,x\n0,1\n")
+    for name in ("folder.zip", "other.csv"):
+        with pytest.raises(BadInput, match=r"ROS 1 bag, a \.db3 or an MCAP"):
+            read_states(tmp_path / name)
     with pytest.raises(NoUsableTopic, match="not of one --arm"):
         read_states(two, arm="PSM3")
     assert len(read_states(two, arm="PSM1")[0]) == len(made.stamps_s)

@@ -240,6 +240,7 @@ def test_a_published_arms_gains_are_round_numbers():
     for joint in ("wrist_pitch", "wrist_yaw"):
         assert of[joint, "stiffness"].low < 7.0 < of[joint, "stiffness"].high
     assert not servo.velocities and not servo.gravity_compensated
+    assert not of["roll", "stiffness"].written and servo.stiffness[3] == Servo().stiffness[3]  # no gain explains it
     # The loads are others than published: much less of them is left, and the law of insertion is none of this arm.
     assert [of[joint, "load"].fitted for joint in ("yaw", "pitch")] == pytest.approx([-0.27, 0.13], abs=0.01)
     assert (servo.load[0][0], servo.load[1][0]) == (0.0, 0.0)
@@ -270,5 +271,5 @@ def test_a_servo_of_one_half_predicts_a_published_arms_other_half(left_out):
         servo = replace(servo, play=((0.0,) * 6,) * 2)  # encoders sit before it
         found[name] = off_mm(predict(wanted, test[0], servo, ranged=False).executed.joints)
     print(found)
-    expected = ([3.44, 3.47, 2.93, 1.11, 0.82, 0.60], [3.55, 3.55, 3.32, 1.70, 0.77, 0.64])[left_out]
+    expected = ([3.44, 3.47, 2.93, 1.11, 0.82, 0.59], [3.55, 3.55, 3.32, 1.70, 0.77, 0.64])[left_out]
     assert list(found.values()) == pytest.approx(expected, abs=0.01)

@@ -15,6 +15,8 @@ import json
 import re
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import get_args
 
@@ -85,7 +87,6 @@ def read_measured(
         return _of_table(columns, instrument)
     with file.open("rb") as opened:
         recording = read_recording(opened)
-        kind = media_type_of(opened)
     motion = recording.motion_of(arm=arm)
     setpoints = recording.setpoint_of(motion)
     if setpoints is None:
@@ -100,11 +101,7 @@ def read_measured(
         raise BadRecording("No setpoint was recorded within one period of a measured pose; record both at once.")
     marker_mm = None
     if tracker is not None:
-        if SUFFIXES[kind] not in get_args(Suffix):
-            raise BadInput(
-                "A tracker is read from a ROS 1 bag, a .db3 or an MCAP file; give the file in the bag's folder."
-            )
-        marker_mm = _marker_mm(file, SUFFIXES[kind], tracker, motion.stamps_ns)
+        marker_mm = _marker_mm(file, tracker, motion.stamps_ns)
         beside &= np.isfinite(marker_mm).all(axis=1)
         if not beside.any():
             raise BadRecording(
@@ -125,7 +122,7 @@ def read_states(file: Path, *, arm: str | None = None, rate_hz: float | None = N
     """Read measured states and setpoints of an arm's joints.
 
     Args:
-        file: A ROS 1 bag, a .db3 or an MCAP file with that suffix, or a table whose header has the columns of joints.
+        file: A ROS 1 bag, a .db3 or an MCAP file, or a table whose header has the columns of joints.
         arm: The arm of a bag with several.
         rate_hz: Samples per second of a table without times; None: the arm is taken to rest at each sample.
 
@@ -142,12 +139,13 @@ def read_states(file: Path, *, arm: str | None = None, rate_hz: float | None = N
         states[:, :, 0] = np.reshape([columns[name] for name in _NEEDED], (2, 6, -1)).swapaxes(1, 2)
         states[0, :, 1] = np.nan if "t_s" in columns else 0.0
         return stamps_s, states[0], states[1]
-    names = sorted(one.name for one in topics_in([file]))
-    found = [name for name in names if re.search(f"/{re.escape(arm) if arm else 'PSM[0-9]*'}/measured_js$", name)]
-    pair = [*found, *(name.replace("measured", "setpoint") for name in found)]
-    if len(pair) != 2 or pair[1] not in names:
-        raise NoUsableTopic(f"The bag has no measured_js with setpoint_js, or not of one --arm: {names[:20]}. {RECORD}")
-    (at_ns, measured), (sent_ns, setpoints) = (numbers_on(file, topic, STATES) for topic in pair)
+    with _suffixed(file) as bag:
+        names = sorted(one.name for one in topics_in([bag]))
+        found = [name for name in names if re.search(f"/{re.escape(arm) if arm else 'PSM[0-9]*'}/measured_js$", name)]
+        pair = [*found, *(name.replace("measured", "setpoint") for name in found)]
+        if len(pair) != 2 or pair[1] not in names:
+            raise NoUsableTopic(f"No measured_js with setpoint_js, or not of one --arm: {names[:20]}. {RECORD}")
+        (at_ns, measured), (sent_ns, setpoints) = (numbers_on(bag, topic, STATES) for topic in pair)
     chosen, beside = _beside(at_ns, sent_ns)
     states = np.stack([measured, setpoints[chosen]])[:, beside].reshape(2, -1, 3, 6)
     return (at_ns - at_ns[0])[beside] / 1e9, states[0], states[1]
@@ -160,12 +158,21 @@ def _beside(stamps_ns: Ints, setpoints_ns: Ints) -> tuple[Ints, Flags]:
     return chosen, np.abs(setpoints_ns[chosen] - stamps_ns) <= period_ns
 
 
-def _marker_mm(file: Path, suffix: str, tracker: str, at_ns: Ints) -> Floats:
+@contextmanager
+def _suffixed(file: Path) -> Iterator[Path]:
+    """Copy a bag to a path with the suffix of its format, as rosbags knows a format by its suffix alone."""
+    with file.open("rb") as opened:
+        suffix = SUFFIXES[media_type_of(opened)]
+    if suffix not in get_args(Suffix):
+        raise BadInput("Topics are read from a ROS 1 bag, a .db3 or an MCAP file; give the file in the bag's folder.")
+    with tempfile.TemporaryDirectory() as folder:
+        yield shutil.copyfile(file, Path(folder) / f"bag{suffix}")
+
+
+def _marker_mm(file: Path, tracker: str, at_ns: Ints) -> Floats:
     """Return the marker's positions at the stamps, (N, 3); NaN where it was not seen shortly before and after."""
-    with tempfile.TemporaryDirectory() as folder:  # rosbags knows a format by its suffix alone
-        named = Path(folder) / f"bag{suffix}"
-        shutil.copyfile(file, named)
-        stamps_ns, place_m = numbers_on(named, tracker, PLACES)
+    with _suffixed(file) as bag:
+        stamps_ns, place_m = numbers_on(bag, tracker, PLACES)
     begin = stamps_ns[0]
     times, at = (stamps_ns - begin).astype(np.float64), (at_ns - begin).astype(np.float64)
     found = np.stack([np.interp(at, times, axis, left=np.nan, right=np.nan) for axis in place_m.T * _M_TO_MM], axis=1)
