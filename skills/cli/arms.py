@@ -6,8 +6,10 @@ from typing import Annotated
 import typer
 
 from skills.cli.commands import command
-from skills.cli.output import Answer, say, show_cells
+from skills.cli.output import Answer, say, show_cells, table
+from skills.errors import BadInput
 
+SERVO = ("joint", "quantity", "fitted", "low", "high", "published", "left_out", "as_published", "no_error", "constant")
 commands = typer.Typer()
 COLUMNS = ("error", "mean", "deviation", "independent", "band 90 %", "held", "width", "assumed holds", "width")
 
@@ -22,6 +24,7 @@ def calibrate(
     tracker: str | None = None,
     cell_mm: Annotated[float | None, typer.Option("--cell")] = None,
     to: Path | None = None,
+    servo: Path | None = None,
 ) -> Answer:
     """Measure an arm's own errors: setpoints compared with measured poses, and with a tracker's if there is one.
 
@@ -34,13 +37,22 @@ def calibrate(
         tracker: The topic of a bag with a tracker's positions of a marker on the tool.
         cell_mm: Also measure the slip on a grid with cells of this size, in mm.
         to: Write the errors to this JSON file, for `play --errors` and SKILLS_ARM_ERRORS.
+        servo: Instead fit gains, friction and load to measured_js and setpoint_js, and write them to this JSON file.
     """
     from skills.fields import as_json as plain
-    from skills.library.plans.arm_errors import read_measured
+    from skills.library.plans.arm_errors import read_measured, read_states
     from skills.packing import canonical
     from skills.verification.arm_calibration import calibrate_arm
     from skills.verification.arm_slip import measure_slip
+    from skills.verification.servo_fit import fit_servo
 
+    if servo is not None:
+        if (to, tracker, cell_mm) != (None, None, None):
+            raise BadInput("A servo is fitted alone; omit --to, --tracker and --cell.")
+        numbers, fitted, notes = fit_servo(*read_states(bag, arm=arm, rate_hz=rate_hz))
+        servo.write_bytes(canonical(plain(fitted)) + b"\n")
+        document = {"quantities": [plain(one) for one in numbers], "servo": plain(fitted), "notes": notes}
+        return table(document, SERVO, *notes, rows=numbers)
     measured = read_measured(bag, arm=arm, instrument=instrument, rate_hz=rate_hz, tracker=tracker)
     found = calibrate_arm(measured, name=name)
     slip = None if cell_mm is None else measure_slip(measured, cell_mm)

@@ -17,10 +17,11 @@ opens before its first query, and limits:
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Literal
 
@@ -28,8 +29,9 @@ import apsw
 import numpy as np
 
 from skills.arrays import Floats, Ints
+from skills.demonstration.motion import forward_samples
 from skills.demonstration.recording import NS_PER_S, Format, Integrity, Recording, Topic
-from skills.errors import BackwardStamps, NoUsableTopic, UnreadableRecording
+from skills.errors import NoUsableTopic, UnreadableRecording
 from skills.formats import topics
 from skills.formats.archive import printable, refusing
 from skills.formats.bag_writer import Message, write_messages
@@ -269,46 +271,45 @@ def topics_in(paths: Sequence[Path]) -> tuple[Topic, ...]:
         return _topics(reader)
 
 
-def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
-    """Return the positions on any topic of a bag, such as a tracker's of a marker; messages without one are left out.
+def numbers_on(path: Path, topic: str, of: "Numbers") -> tuple[Ints, Floats]:
+    """Return numbers on any topic of a bag; messages where one of the first three is not finite are left out.
 
     Args:
         path: The bag, with the suffix of its format.
-        topic: A topic of PoseStamped, TransformStamped or PointStamped messages.
+        topic: The topic.
+        of: The numbers of a message by its type: `PLACES`, such as a tracker's of a marker, or `STATES` of joints.
 
     Returns:
-        Stamps of the headers in ns, ascending, shape (N,), and positions in mm, shape (N, 3).
+        Stamps of the headers in ns, ascending, shape (N,), and the numbers in units of the bag, shape (N, K).
 
     Raises:
         UnreadableRecording: rosbags cannot read it.
         NoUsableTopic: There is no such topic of such messages, or it has no position.
-        BackwardStamps: The stamps do not increase.
+        BackwardStamps, RepeatedStamps: More stamps than `forward_samples` drops do not increase.
     """
     with _reading([path]) as reader:
         kinds = [(one.topic, one.msgtype) for one in reader.connections]
-        wanted = [one for one in reader.connections if one.topic == topic and one.msgtype in _PLACES]
+        wanted = [one for one in reader.connections if one.topic == topic and one.msgtype in of]
         if not wanted:
-            fitting = sorted({name for name, kind in kinds if kind in _PLACES})
+            fitting = sorted({name for name, kind in kinds if kind in of})
             raise NoUsableTopic(
-                f"The bag has no positions on {topic}: a tracker's topic has {', '.join(_PLACES)} messages. It has "
-                f"such messages on {', '.join(fitting[:20]) or 'no topic'}.",
+                f"The bag has no positions on {topic}, which are in {', '.join(of)} messages. It has such messages on "
+                f"{', '.join(fitting[:20]) or 'no topic'}.",
                 *did_you_mean(topic, fitting),
                 topic=topic,
             )
-        stamps, places = [], []
+        stamps, numbers = [], []
         for connection, _, data in reader.messages(connections=wanted):
             said: Any = reader.deserialize(data, connection.msgtype)
-            place = _PLACES[connection.msgtype](said)
             stamps.append(int(said.header.stamp.sec) * NS_PER_S + int(said.header.stamp.nanosec))
-            places.append((place.x, place.y, place.z))
-    place_mm = 1000.0 * np.array(places, np.float64).reshape(-1, 3)
-    seen = np.isfinite(place_mm).all(axis=1)  # a tracker that has lost its marker says NaN
+            numbers.append([*of[connection.msgtype](said)])
+    rows = np.array(numbers or np.zeros((0, 3)), np.float64)
+    seen = np.isfinite(rows[:, :3]).all(axis=1)  # a tracker that has lost its marker says NaN
     stamps_ns = np.array(stamps, np.int64)[seen]
     if not len(stamps_ns):
         raise NoUsableTopic(f"{topic} has no position.", topic=topic)
-    if not (np.diff(stamps_ns) > 0).all():
-        raise BackwardStamps(f"The stamps of {topic} do not increase; record the tracker's own stamps.", topic=topic)
-    return stamps_ns, place_mm[seen]
+    kept = forward_samples(topic, stamps_ns, rows[seen]).kept
+    return (stamps_ns, rows[seen]) if kept is None else (stamps_ns[kept], rows[seen][kept])
 
 
 @cache
@@ -384,11 +385,12 @@ def _cdr(data: bytes, kind: str) -> bytes:
         return b"\0\1\0\0"
 
 
-_PLACES: dict[str, Callable[[Any], Any]] = {
-    topics.POSE: lambda said: said.pose.position,
-    topics.TRANSFORM: lambda said: said.transform.translation,
-    topics.POINT: lambda said: said.point,
-}
+_AT = ((topics.POSE, "pose.position"), (topics.TRANSFORM, "transform.translation"), (topics.POINT, "point"))
+_ROWS = attrgetter("position", "velocity", "effort")
+Numbers = Mapping[str, Callable[[Any], Iterable[float]]]  # of a message, by its type
+PLACES: Numbers = {kind: attrgetter(*(f"{place}.{axis}" for axis in "xyz")) for kind, place in _AT}
+# Positions, velocities and efforts of six joints; NaN where there are fewer.
+STATES: Numbers = {topics.JOINT_STATE: lambda said: np.ravel([[*row, *[np.nan] * 6][:6] for row in _ROWS(said)])}
 
 
 def _copied(file: BinaryIO, path: Path) -> Path:

@@ -6,8 +6,9 @@ may be below any namespace, as in `/CRTK/psm2/measured_cp`. dVRK 1.x has other n
 `position_cartesian_local_current`, `state_joint_current`, `state_jaw_current` and `state_gripper_current`.
 
 Only measured motions are learnt from. Setpoints of a PSM's tip and jaw are read beside them, because a dataset may have
-them as its actions; they are never motions. Setpoints of joints (`setpoint_js`) are not read: known recorders take
-`setpoint_cp` beside them, and as poses they would need the instrument. Other commands (`servo_cp`, `move_cp` and the
+them as its actions; they are never motions. Setpoints of joints (`setpoint_js`) are no part of a recording: known
+recorders take `setpoint_cp` beside them, and as poses they would need the instrument; `skills calibrate-arm --servo`
+alone reads them. Other commands (`servo_cp`, `move_cp` and the
 like) are not used, nor are poses of other things (`T_b_w`, the base of an arm in a simulator's world).
 """
 

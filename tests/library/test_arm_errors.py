@@ -13,16 +13,18 @@ from typer.testing import CliRunner
 from skills.cli import app
 from skills.dynamics import Servo
 from skills.errors import BadInput, BadRecording, BadSettings, NoUsableTopic
+from skills.fields import as_json, parse_json
 from skills.formats import bag_writer as messages
 from skills.formats.bag_writer import Message, write_messages
 from skills.kinematics import forward, quaternion_of
-from skills.library.plans.arm_errors import read_measured, stated_errors, stated_servo
+from skills.library.plans.arm_errors import read_measured, read_states, stated_errors, stated_servo
 from skills.verification.arm_calibration import MeasuredArm, calibrate_arm
 from skills.verification.arm_errors import SIZES, UNCALIBRATED
 from skills.verification.arm_slip import measure_slip
 from skills.verification.error_draws import rotation_of
 from tests.formats.bags import sample_folder
 from tests.verification.test_arm_errors import lasting, recorded
+from tests.verification.test_servo_fit import OWN, Simulated, fitted, simulated
 
 NAMES = [f"{kind}_q{k}" for kind in ("measured", "setpoint") for k in range(1, 7)]
 
@@ -223,3 +225,88 @@ def test_the_servo_of_the_page_is_one():
 def test_a_servo_is_stated_or_not():
     assert stated_servo("") is None
     assert stated_servo('{"velocities": false, "most_mm": 1.5}') == Servo(velocities=False, most_mm=1.5)
+
+
+# ---- the servo ------------------------------------------------------------------------------------------------------
+
+
+def states_bag(file: Path, made: Simulated, arm: str = "PSM1", setpoints: bool = True) -> Path:
+    """Write measured_js and, half a ms later, setpoint_js of a simulated arm; what is NaN is not recorded."""
+    said: list[Message] = []
+    for kind, states, late_ns in (("measured_js", made.measured, 0), ("setpoint_js", made.setpoints, 500_000)):
+        if setpoints or kind == "measured_js":
+            for at_s, rows in zip(made.stamps_s, states, strict=True):
+                joints, speeds, efforts = ([] if np.isnan(row[0]) else row.tolist() for row in rows)
+                at_ns = 10**18 + round(at_s * 1e9) + late_ns
+                topic = f"/{arm}/{kind}"
+                said.append(messages.joint_state(topic, at_ns, joints, velocities=speeds, efforts=efforts))
+    return written(file, said)
+
+
+def ran_servo(file: Path, to: Path, *more: str) -> tuple[int, str]:
+    ran = CliRunner().invoke(app, ["calibrate-arm", str(file), "--servo", str(to), *more], env={"COLUMNS": "200"})
+    return ran.exit_code, ran.output
+
+
+def test_a_bag_with_efforts_becomes_the_servo_of_a_file(tmp_path: Path):
+    made, to = simulated(3, 5, gravity_compensated=True, **OWN), tmp_path / "servo.json"
+    file = states_bag(tmp_path / "arm.mcap", made)
+    stamps_s, measured, setpoints = read_states(file)
+    np.testing.assert_allclose(stamps_s, made.stamps_s, atol=1e-9)
+    np.testing.assert_array_equal(measured, made.measured)
+    np.testing.assert_array_equal(setpoints, made.setpoints)
+    code, output = ran_servo(file, to)
+    found, servo, _ = fitted(made)
+    assert code == 0 and "wrist_yaw" in output and "as_published" in output and "left as by default" in output
+    stated = parse_json(Servo, json.loads(to.read_text()))
+    assert stated == servo and stated != Servo() and stated.gravity_compensated
+    code, output = ran_servo(file, to, "--json")
+    document = json.loads(output)
+    assert code == 0 and document["servo"] == json.loads(json.dumps(as_json(servo)))
+    assert [one["fitted"] for one in document["quantities"]] == [one.fitted for one in found]
+
+
+def test_a_bag_without_efforts_has_the_static_part_and_says_what_to_record(tmp_path: Path):
+    file = states_bag(tmp_path / "arm.mcap", simulated(3, 5, efforts=False, gravity_compensated=True, **OWN), "PSM2")
+    code, output = ran_servo(file, tmp_path / "servo.json")
+    assert code == 0 and output.count("compensation") >= 3 and "stiffness" not in output.partition("All is")[0]
+    assert "There are no efforts" in output and "ros2 bag record" in output
+    assert parse_json(Servo, json.loads((tmp_path / "servo.json").read_text())).stiffness == Servo().stiffness
+
+
+def test_without_setpoints_or_joints_the_sentence_says_what_to_record(tmp_path: Path):
+    made, to = simulated(3, 5, **OWN), tmp_path / "servo.json"
+    for file in (states_bag(tmp_path / "joints.mcap", made, setpoints=False), bag(tmp_path / "poses.mcap", 50)):
+        code, output = ran_servo(file, to)
+        assert code == 1 and "ros2 bag record /PSM1/measured_js /PSM1/setpoint_js" in output and not to.exists()
+    two = states_bag(tmp_path / "without-a-suffix", made)
+    with zipfile.ZipFile(tmp_path / "folder.zip", "w") as out:
+        out.write(two, "bag/bag_0.mcap")
+    (tmp_path / "other.csv").write_text("time,x\n0,1\n")
+    for name in ("folder.zip", "other.csv"):
+        with pytest.raises(BadInput, match=r"ROS 1 bag, a \.db3 or an MCAP"):
+            read_states(tmp_path / name)
+    with pytest.raises(NoUsableTopic, match="not of one --arm"):
+        read_states(two, arm="PSM3")
+    assert len(read_states(two, arm="PSM1")[0]) == len(made.stamps_s)
+    for more in (["--to", "x.json"], ["--tracker", "/NDI"], ["--cell", "5"]):
+        assert "Omit --to, --tracker and --cell" in ran_servo(two, to, *more)[1]
+
+
+def test_a_table_of_joints_has_the_static_part(tmp_path: Path):
+    stamps_s, measured, setpoints = read_states(table(tmp_path / "joints.csv"))
+    assert stamps_s.tolist() == list(range(30)) and (measured[:, 0] == 0.1).all() and (setpoints[:, 0] == 0.1).all()
+    assert (measured[:, 1] == 0).all() and np.isnan(measured[:, 2]).all() and np.isnan(setpoints[:, 1:]).all()
+    timed, still, _ = read_states(table(tmp_path / "joints.csv"), rate_hz=50.0)
+    assert timed[-1] == pytest.approx(29 / 50) and np.isnan(still[:, 1]).all()
+
+
+@pytest.mark.needs("recordings")
+def test_the_command_fits_a_published_recording_and_table(tmp_path: Path):
+    folder, to = sample_folder() / "calibration", tmp_path / "servo.json"
+    code, output = ran_servo(folder / "raw_sensor_rosbag_09_traj3.csv", to)
+    assert code == 0 and "1.096" in output and "There are no efforts" in output
+    stated = json.loads(to.read_text())
+    assert stated["gravity_compensated"] and stated["compensation"][0][:2] == [1.055, 0.8456]
+    code, output = ran_servo(folder / "pitch_exp_traj_02_test_cropped.bag", to)  # one of its stamps goes back
+    assert code == 0 and json.loads(to.read_text())["stiffness"][2] == 8000.0

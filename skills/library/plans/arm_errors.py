@@ -13,23 +13,27 @@ dVRK's `measured_js` has them. With a tracker it also has `marker_x`, `marker_y`
 """
 
 import json
+import re
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, get_args
+from typing import get_args
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from skills.arrays import Floats, Ints
+from skills.arrays import Flags, Floats, Ints, nearest
 from skills.dynamics import Servo
-from skills.errors import BadInput, BadRecording, BadSettings
+from skills.errors import BadInput, BadRecording, BadSettings, NoUsableTopic
 from skills.formats import SUFFIXES, media_type_of, read_recording
 from skills.formats.cells import TableLayout, header_of, open_text, read_numbers
-from skills.formats.rosbag import Suffix, positions_on
+from skills.formats.rosbag import PLACES, STATES, Suffix, numbers_on, topics_in
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
 from skills.verification.arm_calibration import MeasuredArm
 from skills.verification.arm_errors import NAMED, SIZES, ArmErrors, checked_own
+from skills.verification.servo_fit import RECORD
 
 LOST_PERIODS = 3.0  # ours: between positions further apart than so many of its periods the tracker had lost the marker
 _JOINTS = tuple(f"q{number}" for number in range(1, 7))
@@ -95,16 +99,12 @@ def read_measured(
         BadRecording: The recording cannot be used, or has no setpoints of the arm.
         OSError: The file cannot be read.
     """
+    if (columns := _columns(file, rate_hz)) is not None:
+        if tracker is not None:
+            raise BadInput(f"A table has the tracker's positions in {', '.join(_MARKER)}; omit the topic.")
+        return _of_table(columns, instrument)
     with file.open("rb") as opened:
-        header = opened.readline(4096).decode("utf-8", "replace").strip().lower().split(",")
-        if set(_NEEDED) & set(header):
-            if tracker is not None:
-                raise BadInput(f"A table has the tracker's positions in {', '.join(_MARKER)}; omit the topic.")
-            opened.seek(0)
-            return _of_table(opened, instrument, rate_hz)
-        opened.seek(0)
         recording = read_recording(opened)
-        kind = media_type_of(opened)
     motion = recording.motion_of(arm=arm)
     setpoints = recording.setpoint_of(motion)
     if setpoints is None:
@@ -114,21 +114,12 @@ def read_measured(
         )
     if motion.rotation_xyzw is None or setpoints.rotation_xyzw is None:
         raise BadRecording(f"The poses of {motion.arm} have no rotations; record its setpoint_cp and measured_cp.")
-    after = np.minimum(np.searchsorted(setpoints.stamps_ns, motion.stamps_ns), len(setpoints.stamps_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    sooner = motion.stamps_ns - setpoints.stamps_ns[before] < setpoints.stamps_ns[after] - motion.stamps_ns
-    nearest = np.where(sooner, before, after)
-    period_ns = np.median(np.diff(setpoints.stamps_ns)) if len(setpoints.stamps_ns) > 1 else 0
-    beside = np.abs(setpoints.stamps_ns[nearest] - motion.stamps_ns) <= period_ns
+    chosen, beside = _beside(motion.stamps_ns, setpoints.stamps_ns)
     if not beside.any():
         raise BadRecording("No setpoint was recorded within one period of a measured pose; record both at once.")
     marker_mm = None
     if tracker is not None:
-        if SUFFIXES[kind] not in get_args(Suffix):
-            raise BadInput(
-                "A tracker is read from a ROS 1 bag, a .db3 or an MCAP file; give the file in the bag's folder."
-            )
-        marker_mm = _marker_mm(file, SUFFIXES[kind], tracker, motion.stamps_ns)
+        marker_mm = _marker_mm(file, tracker, motion.stamps_ns)
         beside &= np.isfinite(marker_mm).all(axis=1)
         if not beside.any():
             raise BadRecording(
@@ -136,8 +127,8 @@ def read_measured(
             )
         marker_mm = marker_mm[beside]
     return MeasuredArm(
-        setpoint_mm=setpoints.tip_mm[nearest][beside],
-        setpoint=matrix_of(setpoints.rotation_xyzw[nearest][beside]),
+        setpoint_mm=setpoints.tip_mm[chosen][beside],
+        setpoint=matrix_of(setpoints.rotation_xyzw[chosen][beside]),
         measured_mm=motion.tip_mm[beside],
         measured=matrix_of(motion.rotation_xyzw[beside]),
         stamps_s=recording.seconds(motion.stamps_ns[beside]),
@@ -145,42 +136,97 @@ def read_measured(
     )
 
 
-def _marker_mm(file: Path, suffix: str, tracker: str, at_ns: Ints) -> Floats:
+def read_states(file: Path, *, arm: str | None = None, rate_hz: float | None = None) -> tuple[Floats, Floats, Floats]:
+    """Read measured states and setpoints of an arm's joints.
+
+    Args:
+        file: A ROS 1 bag, a .db3 or an MCAP file, or a table whose header has the columns of joints.
+        arm: The arm of a bag with several.
+        rate_hz: Samples per second of a table without times; None: the arm is taken to rest at each sample.
+
+    Returns:
+        Times in s, measured states, and the setpoints nearest in time, as for `skills.verification.servo_fit`.
+
+    Raises:
+        BadInput, OSError: As for `read_measured`.
+        BadRecording: The bag cannot be read, or lacks measured joints or setpoints of the arm.
+    """
+    if (columns := _columns(file, rate_hz)) is not None:
+        stamps_s = columns.get("t_s", np.arange(len(columns[_NEEDED[0]]), dtype=np.float64))
+        states = np.full((2, len(stamps_s), 3, 6), np.nan)
+        states[:, :, 0] = np.reshape([columns[name] for name in _NEEDED], (2, 6, -1)).swapaxes(1, 2)
+        states[0, :, 1] = np.nan if "t_s" in columns else 0.0
+        return stamps_s, states[0], states[1]
+    with _suffixed(file) as bag:
+        names = sorted(one.name for one in topics_in([bag]))
+        found = [name for name in names if re.search(f"/{re.escape(arm) if arm else 'PSM[0-9]*'}/measured_js$", name)]
+        pair = [*found, *(name.replace("measured", "setpoint") for name in found)]
+        if len(pair) != 2 or pair[1] not in names:
+            raise NoUsableTopic(f"No measured_js with setpoint_js, or not of one --arm: {names[:20]}. {RECORD}")
+        (at_ns, measured), (sent_ns, setpoints) = (numbers_on(bag, topic, STATES) for topic in pair)
+    chosen, beside = _beside(at_ns, sent_ns)
+    states = np.stack([measured, setpoints[chosen]])[:, beside].reshape(2, -1, 3, 6)
+    return (at_ns - at_ns[0])[beside] / 1e9, states[0], states[1]
+
+
+def _beside(stamps_ns: Ints, setpoints_ns: Ints) -> tuple[Ints, Flags]:
+    """Return the setpoint nearest to each stamp, and whether it is within one period of the setpoints."""
+    chosen = nearest(setpoints_ns, stamps_ns)
+    period_ns = np.median(np.diff(setpoints_ns)) if len(setpoints_ns) > 1 else 0
+    return chosen, np.abs(setpoints_ns[chosen] - stamps_ns) <= period_ns
+
+
+@contextmanager
+def _suffixed(file: Path) -> Iterator[Path]:
+    """Copy a bag to a path with the suffix of its format, as rosbags knows a format by its suffix alone."""
+    with file.open("rb") as opened:
+        suffix = SUFFIXES[media_type_of(opened)]
+    if suffix not in get_args(Suffix):
+        raise BadInput("Topics are read from a ROS 1 bag, a .db3 or an MCAP file; give the file in the bag's folder.")
+    with tempfile.TemporaryDirectory() as folder:
+        yield shutil.copyfile(file, Path(folder) / f"bag{suffix}")
+
+
+def _marker_mm(file: Path, tracker: str, at_ns: Ints) -> Floats:
     """Return the marker's positions at the stamps, (N, 3); NaN where it was not seen shortly before and after."""
-    with tempfile.TemporaryDirectory() as folder:  # rosbags knows a format by its suffix alone
-        named = Path(folder) / f"bag{suffix}"
-        shutil.copyfile(file, named)
-        stamps_ns, place_mm = positions_on(named, tracker)
+    with _suffixed(file) as bag:
+        stamps_ns, place_m = numbers_on(bag, tracker, PLACES)
     begin = stamps_ns[0]
     times, at = (stamps_ns - begin).astype(np.float64), (at_ns - begin).astype(np.float64)
-    found = np.stack([np.interp(at, times, axis, left=np.nan, right=np.nan) for axis in place_mm.T], axis=1)
+    found = np.stack([np.interp(at, times, axis, left=np.nan, right=np.nan) for axis in place_m.T * _M_TO_MM], axis=1)
     gaps = np.diff(times)
     if len(gaps):
         found[gaps[np.searchsorted(times[1:-1], at)] > LOST_PERIODS * np.median(gaps)] = np.nan
     return found
 
 
-def _of_table(opened: BinaryIO, instrument: str, rate_hz: float | None) -> MeasuredArm:
-    with open_text(opened) as text:
-        names, separator = header_of(text)
-        names = [name.lower() for name in names]
-        if missing := [name for name in _NEEDED if name not in names]:
-            raise BadInput(f"The table has no column {missing[0]}; give {', '.join(_NEEDED)} in rad and m.")
-        wanted = [name for name in (*_NEEDED, *_MARKER, "t_s") if name in names]
-        layout = TableLayout(names, [[names.index(name)] for name in wanted], separator)
-        numbers = read_numbers(text, layout)
+def _columns(file: Path, rate_hz: float | None) -> dict[str, Floats] | None:
+    """Return the columns of a table of joints, with times where they are known; None for a recording."""
+    with file.open("rb") as opened:
+        header = opened.readline(4096).decode("utf-8", "replace").strip().lower().split(",")
+        if not set(_NEEDED) & set(header):
+            return None
+        opened.seek(0)
+        with open_text(opened) as text:
+            names, separator = header_of(text)
+            names = [name.lower() for name in names]
+            if missing := [name for name in _NEEDED if name not in names]:
+                raise BadInput(f"The table has no column {missing[0]}; give {', '.join(_NEEDED)} in rad and m.")
+            wanted = [name for name in (*_NEEDED, *_MARKER, "t_s") if name in names]
+            numbers = read_numbers(text, TableLayout(names, [[names.index(name)] for name in wanted], separator))
     columns = {name: group[:, 0] for name, group in zip(wanted, numbers.groups, strict=True)}
     if rate_hz is not None and not 0 < rate_hz <= 10_000:
         raise BadInput("The rate must be a number of samples per second above 0, at most 10000.", rate_hz=rate_hz)
-    stamps_s = columns.get("t_s")
-    if stamps_s is None and rate_hz is not None:
-        stamps_s = np.arange(numbers.rows) / rate_hz
+    return columns if rate_hz is None else {"t_s": np.arange(numbers.rows) / rate_hz} | columns
+
+
+def _of_table(columns: dict[str, Floats], instrument: str) -> MeasuredArm:
     (setpoint_mm, setpoint), (measured_mm, measured) = (
         forward(_joints(columns, kind), instrument) for kind in ("setpoint", "measured")
     )
     marked = set(_MARKER) <= set(columns)
     marker_mm = np.stack([columns[name] for name in _MARKER], axis=1) * _M_TO_MM if marked else None
-    return MeasuredArm(setpoint_mm, setpoint, measured_mm, measured, stamps_s, marker_mm)
+    return MeasuredArm(setpoint_mm, setpoint, measured_mm, measured, columns.get("t_s"), marker_mm)
 
 
 def _joints(columns: dict[str, Floats], kind: str) -> Floats:
