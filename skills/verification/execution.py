@@ -45,8 +45,8 @@ class Execution:
         causes_mm: How far droop, lag and stick of each joint move the tip, shape (T, 6, 3); they add up as vectors.
         causes_deg: How far they turn the jaws, shape (T, 6, 3).
         dominant: Index of the joint, and of the cause in `CAUSES`, that moves the tip most, shape (T, 2).
-        mean_mm: Mean error of the tip.
-        remedies_mm: The same with each remedy that the servo lacks.
+        mean_mm: Mean error of the tip in the pass with the greatest error.
+        remedies_mm: The same with each remedy that the servo lacks, in that pass alone.
         failure: The first sample beyond a limit; None if there is none.
         surely: Whether the arm in the middle of the ranges fails, and not only one at their ends.
         reasons: All of this in sentences.
@@ -87,12 +87,12 @@ class ExecutionReport:
 
     Attributes:
         servo: The arm and how it is driven, as the laboratory states.
-        mean_mm: Mean error of the tip.
+        mean_mm: Mean error of the tip in the pass with the greatest error.
         worst_mm: Its greatest error, and the least and the greatest of all arms of the ranges at that moment.
         worst_s: That moment.
         worst_deg: The greatest error of the jaws' rotation likewise.
         effort: The greatest effort of any of the arms, as a part of its limit.
-        remedies_mm: The mean error with each remedy that the servo lacks.
+        remedies_mm: The mean error in that pass with each remedy that the servo lacks.
         failure: The first sample beyond a limit; null if there is none.
         surely: Whether the arm in the middle of the ranges fails, and not only one at their ends.
         reasons: All of this in sentences.
@@ -154,9 +154,12 @@ def execution_of(
     causes_mm, causes_deg = causes * sizes[:, :, None], np.degrees(causes)
     causes_deg[:, INSERTION] = 0.0
     dominant = np.stack(np.divmod(causes_mm.reshape(-1, 18).argmax(axis=1), 3), axis=1)
-    mean_mm, helped = float(found.off_mm[0].mean()), {}
+    worst = trajectory.pass_index == trajectory.pass_index[int(found.off_mm[0].argmax())]
+    mean_mm, helped = float(found.off_mm[0, worst].mean()), {}
     for name, other in remedied(servo).items():
-        again = predict(trajectory.joints, trajectory.stamps_s, other, trajectory.instrument, ranged=False)
+        again = predict(
+            trajectory.joints[worst], trajectory.stamps_s[worst], other, trajectory.instrument, ranged=False
+        )
         helped[name] = float(again.off_mm[0].mean())
     clear, hand_offs = _surely_clear(trajectory, found, known, allowed), _hand_offs(trajectory, known.approach_m)
     failure = _failure(trajectory, servo, found, one, known, allowed, clear, hand_offs)
@@ -200,11 +203,10 @@ def _failure(
     hand_offs: Mapping[int, HandOff],
 ) -> Failure | None:
     """Return the first failure of one arm's motion."""
-    tip_mm, rotation = forward(arm.joints, trajectory.instrument)
-    moved = replace(trajectory, joints=arm.joints, tip_mm=tip_mm, rotation_xyzw=quaternion_of(rotation))
-    row, missed = 0 if arm is found.executed else 2, np.zeros(len(trajectory))
-    for end, planned in hand_offs.items():
-        missed[end] = not _caught(planned, tip_mm[end], rotation[end])
+    row, missed, ends = 0 if arm is found.executed else 2, np.zeros(len(trajectory)), [*hand_offs]
+    for end, tip_mm, jaw in zip(ends, *forward(arm.joints[ends], trajectory.instrument), strict=True):
+        missed[end] = not _caught(hand_offs[end], tip_mm, jaw)
+    moved = None if all(clear) else _moved(trajectory, arm.joints)
     tool = instrument_of(trajectory.instrument)
     errors = {
         "error of the tip": ("mm", found.off_mm[row], servo.most_mm),
@@ -217,17 +219,24 @@ def _failure(
         trajectory,
         limits,
         errors,
-        beside=None if known.scene is None or clear[1] else clearance_of(moved, known.scene),
-        outer=None if clear[0] else bodies_clearance(moved, limits.clearance_bodies_mm),
+        beside=None if moved is None or known.scene is None or clear[1] else clearance_of(moved, known.scene),
+        outer=None if moved is None or clear[0] else bodies_clearance(moved, limits.clearance_bodies_mm),
         intent=None if known.request is None or clear[2] else compare(known.request, trajectory, arm.joints),
     )
+
+
+def _moved(trajectory: Trajectory, joints: Floats) -> Trajectory:
+    """Return a motion with other joints of PSM_A."""
+    tip_mm, rotation = forward(joints, trajectory.instrument)
+    return replace(trajectory, joints=joints, tip_mm=tip_mm, rotation_xyzw=quaternion_of(rotation))
 
 
 def _hand_offs(trajectory: Trajectory, approach_m: ArrayLike | None) -> dict[int, HandOff]:
     """Return the hand-offs at which the needle is caught as planned, by the sample at which they are."""
     found, varied = {}, EstimateSettings()
     for number, end in enumerate(trajectory.last_samples.tolist()):
-        arms = at_hand_off(scene_of(trajectory, number, -inf, varied.opening_rad), approach_m, varied.unknown_depth_mm)
+        planned_end = scene_of(trajectory, number, -inf, varied.opening_rad, last=True)
+        arms = at_hand_off(planned_end, approach_m, varied.unknown_depth_mm)
         if arms is not None:
             (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses_of(arm.joints) for arm in arms)
             planned = HandOff(tip_a[0], jaw_a[0], tip_m[0], jaw_m[0])
@@ -248,7 +257,7 @@ def _reasons(found: Execution, trajectory: Trajectory, servo: Servo) -> list[str
     mm, deg, effort = found.predicted.off_mm, found.predicted.off_deg, found.predicted.effort
     worst, turned = int(mm[0].argmax()), int(deg[0].argmax())
     lines = [
-        f"The tip is predicted {found.mean_mm:.2f} mm off the plan on average and {mm[0, worst]:.2f} mm at worst "
+        f"The tip is predicted {mm[0].mean():.2f} mm off the plan on average and {mm[0, worst]:.2f} mm at worst "
         f"({mm[1, worst]:.2f} to {mm[2, worst]:.2f}), at {trajectory.stamps_s[worst]:.3f} s; the jaws are turned by "
         f"{deg[0, turned]:.1f} degrees at worst ({deg[1, turned]:.1f} to {deg[2, turned]:.1f})."
     ]
@@ -259,7 +268,7 @@ def _reasons(found: Execution, trajectory: Trajectory, servo: Servo) -> list[str
                 size = f"{causes[joint, cause]:.2f} {unit}"
                 lines.append(f"{CAUSES[cause].capitalize()} of {JOINTS[joint]} {size}: {_advice(cause, servo)}.")
     lines += [
-        f"With {name} the mean error is {after:.2f} mm instead of {found.mean_mm:.2f} mm."
+        f"With {name} the mean error of that pass is {after:.2f} mm instead of {found.mean_mm:.2f} mm."
         for name, after in found.remedies_mm.items()
     ]
     at, joint = np.unravel_index(int(effort.argmax()), effort.shape)

@@ -166,8 +166,10 @@ def scene_of(
     opening_rad: float,
     pad_normal: Point = UPWARDS,
     needle_mm: Floats | None = None,
+    *,
+    last: bool = False,
 ) -> PlannedPass:
-    """Return a pass with all its samples.
+    """Return a pass with all its samples, or the last one alone.
 
     Args:
         trajectory: The planned motion.
@@ -177,8 +179,9 @@ def scene_of(
         pad_normal: Unit direction out of the pad.
         needle_mm: The needle's distance from tissue in each sample of the trajectory, shape (T,), infinite where it is
             not judged; None: nowhere.
+        last: Whether only the last sample is wanted, at which the needle is handed over.
     """
-    samples = np.flatnonzero(trajectory.pass_index == number)
+    samples = np.flatnonzero(trajectory.pass_index == number)[-1 if last else 0 :]
     arms = []
     for arm, unplanned_rad in zip(trajectory.arms, (HOLDING_RAD, opening_rad), strict=False):
         joints, opened = arm.joints[samples], clearance.openings(arm, unplanned_rad)[samples]
