@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from skills.dynamics import NOT_VALIDATED
 from skills.errors import Conflict
+from skills.fields import percent
 from skills.library.plans.description import describe_motion
 from skills.schemas.plans import PlanDescription
 from skills.schemas.playbacks import CountedEvent, Headline, Level, Verdict
@@ -150,7 +151,7 @@ def costs_most(report: Verdict) -> str | None:
         return (
             f"Without any single error of the arms it is not more: the rest is lost by {beside}several errors together."
         )
-    share = _percent(first.without.probability)
+    share = f"{percent(first.without.probability, 1)} %"
     well = OF_WORLDS[counted_as(doubted.under[0])]
     return f"Most is lost by {describe_error(first.error)}: without it {share} of the worlds {well}."
 
@@ -208,13 +209,6 @@ def describe_errors(name: str) -> str:
 
 def _counted(one: Probability) -> str:
     return (
-        f"{one.count} of {one.of} worlds: {_percent(one.probability)} ({_percent(one.lower)} to {_percent(one.upper)}, "
-        "95 %)"
+        f"{one.count} of {one.of} worlds: {percent(one.probability, 1)} % ({percent(one.lower, 1)} % to "
+        f"{percent(one.upper, 1)} %, 95 %)"
     )
-
-
-def _percent(part: float) -> str:
-    """Return a share as a percentage; a share just below 1 is not rounded to 100 %."""
-    if 0.9995 <= part < 1:
-        return "above 99.9 %"
-    return f"{100 * part:.1f} %"
