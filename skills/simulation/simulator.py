@@ -10,7 +10,8 @@ their measurements, file to file:
 * torque, where a servo is stated: PSM_A moves by the torques of `skills.dynamics`, at 1 kHz or more, in windows in
   which it may touch the pad or PSM_M, both rigid, which goes on as planned. Elsewhere the compiled motion stands. The
   fitted load stands for gravity and cables, so gravity is off; links have the inertias of their motors, for which the
-  servo's step is short enough; and the play is added after, so the motors' places are those that touch.
+  servo's step is short enough; jaws do not give way; and the play is added after, so the motors' places are those that
+  touch. Forces are those of the last step before a sample.
 
 The inner loops use lists and PyBullet's units: its calls take microseconds, and so would the creation of each small
 array.
@@ -47,7 +48,6 @@ from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, PAD,
 
 MM = 1e-3
 PLACE, TURN = 4, 5  # indices of the frame in a link's state; 0 and 1 would be its centre of mass
-FINGER_EFFORT = 0.16  # Nm
 FORCE = 9  # index of the force in a contact
 LIGHT_KG, LIGHT_KG_M2 = 1e-4, 1e-7  # ours: of a link beside its motor, a thousandth of it and less
 HEAVY_KG = 1e3  # ours: what touches PSM_M does not move it
@@ -209,11 +209,10 @@ class Simulator:
         return float(sum(point[FORCE] for point in self.bullet.getContactPoints(self.arm.number)))
 
     def weigh(self, inertia: Floats, joints: Floats) -> Floats:
-        """Give PSM_A's links the inertias of its motors, each about its own joint's axis, with its motors off.
+        """Turn PSM_A's motors off, and give each link the inertia of its motor about its own joint's axis.
 
-        So a link weighs on its own joint alone, but for what the matrix beside its diagonal has: links turn with those
-        before them, and the insertion has its mass near the remote centre and not in it. On a robot motors turn
-        on their own.
+        PyBullet knows no rotors beside the links. So a link also resists the joints before its own, and the insertion's
+        mass swings where it is not at the remote centre: for that, which the mass matrices have, torques must allow.
 
         Args:
             inertia: That of each joint, kg m2 and kg, shape (6,).
@@ -329,13 +328,6 @@ class Simulator:
             self.bullet.changeDynamics(number, index, jointLowerLimit=lower, jointUpperLimit=upper)
         for index in arm.fingers:
             self.bullet.resetJointState(number, index, opening_rad)
-        self.bullet.setJointMotorControlArray(
-            number,
-            arm.fingers,
-            self.bullet.POSITION_CONTROL,
-            targetPositions=[opening_rad] * 2,
-            forces=[FINGER_EFFORT] * 2,
-        )
         return arm
 
 
