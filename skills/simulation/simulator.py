@@ -80,14 +80,6 @@ class KinematicPass(NamedTuple):
     psm_m_tip_mm: Floats | None
 
 
-class TorquePass(NamedTuple):
-    """The executed motion: joints, rad and mm, shape (T, 6), efforts and forces as in a `Playback`."""
-
-    joints: Floats
-    efforts: Floats
-    contact_n: Floats
-
-
 CLASSES = packing.known(PlayRequest, Trajectory, OtherArm, Poses, Servo, Playback)
 
 
@@ -557,7 +549,9 @@ def _executed(asked: PlayRequest, servo: Servo, played: Playback) -> Playback:
     return replace(played, tracking_mm=tracking_mm, efforts=efforts, contact_n=contact_n, windows=windows)
 
 
-def torque_pass(scene: Simulator, motion: Trajectory, servo: Servo, executed: Executed, windows: Ints) -> TorquePass:
+def torque_pass(
+    scene: Simulator, motion: Trajectory, servo: Servo, executed: Executed, windows: Ints
+) -> tuple[Floats, Floats, Floats]:
     """Move PSM_A by torques through windows of its executed motion, among things that it can touch.
 
     Args:
@@ -568,7 +562,7 @@ def torque_pass(scene: Simulator, motion: Trajectory, servo: Servo, executed: Ex
         windows: The first and the last sample of each window, shape (W, 2).
 
     Returns:
-        The executed motion, that of PyBullet inside of windows.
+        The executed joints, rad and mm, shape (T, 6), PyBullet's inside of windows; efforts and forces of contact.
     """
     drive = drive_of(motion.joints, motion.stamps_s, servo, servo.arm(0.5, 0.5), motion.instrument)
     joints, efforts, contact_n = executed.joints.copy(), executed.efforts.copy(), np.zeros(len(motion))
@@ -578,7 +572,7 @@ def torque_pass(scene: Simulator, motion: Trajectory, servo: Servo, executed: Ex
         motors, efforts[inside], contact_n[inside] = _stepped(scene, motion, drive, executed.motors[first], first, last)
         for k, motor in enumerate(motors, first + 1):
             joints[k] = np.minimum(np.maximum(joints[k - 1], motor - play), motor + play)
-    return TorquePass(joints, efforts, contact_n)
+    return joints, efforts, contact_n
 
 
 def _stepped(

@@ -1,6 +1,7 @@
 """The torque pass: beside the compiled motion where nothing is touched, and by hand where something is."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -26,16 +27,22 @@ SERVO, NONE = Servo(), ((0.0,) * 6,) * 2
 AGREED_MM = 0.003
 
 
+class Stepped(NamedTuple):
+    joints: np.ndarray
+    efforts: np.ndarray
+    contact_n: np.ndarray
+
+
 def executed_of(motion: Trajectory, servo: Servo) -> np.ndarray:
     return execute(motion.joints, motion.stamps_s, servo, servo.arm(0.5, 0.5), motion.instrument)
 
 
-def stepped(motion: Trajectory, servo: Servo, pad_top_mm: float = -400.0) -> simulator.TorquePass:
+def stepped(motion: Trajectory, servo: Servo, pad_top_mm: float = -400.0) -> Stepped:
     """Step through a whole motion, PSM_A alone with a pad."""
     whole, alone = np.array([[0, len(motion) - 1]]), replace(motion, psm_m=None)
     with simulator.opened(motion.instrument) as scene:
         scene.set_up(alone, pad_top_mm)
-        return torque_pass(scene, alone, servo, executed_of(motion, servo), whole)
+        return Stepped(*torque_pass(scene, alone, servo, executed_of(motion, servo), whole))
 
 
 def apart_mm(motion: Trajectory, servo: Servo) -> tuple[float, float]:
