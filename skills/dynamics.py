@@ -18,13 +18,14 @@ arm in motion: loads, inertias and frictions are a linear fit of ours to one pub
 from dataclasses import dataclass, replace
 from itertools import product
 from math import isfinite, radians
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import arcsin, cos, sin
-from skills.arrays import Floats, frozen
-from skills.compiled import compiled
+from skills.arrays import Floats, Ints, frozen
+from skills.compiled import compiled, inner
 from skills.errors import BadInput, BadSettings
 from skills.fields import Six, exact, schema
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, WRIST_MM, axes_of, forward, instrument_of
@@ -142,6 +143,7 @@ class Executed:
         droop: The part of the joints' error by their load.
         lag: The part by speed, delay, inertia and a limit of effort.
         stick: The part by dry friction and play.
+        motors: Places and speeds of the motors, rad and m, shape (T, 2, 6).
     """
 
     joints: Floats
@@ -149,6 +151,7 @@ class Executed:
     droop: Floats
     lag: Floats
     stick: Floats
+    motors: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +233,40 @@ def loads(joints: Floats) -> Floats:
     return found
 
 
+class Drive(NamedTuple):
+    """A plan and the arm that executes it, as arrays for compiled loops: rad, m, s.
+
+    Attributes:
+        stamps: Times of the samples from the first on, shape (T,).
+        plan: Planned joints, shape (T, 6).
+        speeds: The speeds that are sent, shape (T, 6).
+        waves: Sines of yaw and pitch, then their cosines, shape (T, 4).
+        factors: Those of the loads.
+        parts: The arm, as by `Servo.arm`, and its greatest efforts, shape (9, 6).
+        stream: Longest step, setpoints per second, and their age.
+        known: The sample before the setpoint in force, which loops move on, shape (1,).
+    """
+
+    stamps: Floats
+    plan: Floats
+    speeds: Floats
+    waves: Floats
+    factors: Floats
+    parts: Floats
+    stream: Floats
+    known: Ints
+
+
+def drive_of(joints: Floats, stamps_s: Floats, servo: Servo, arm: Floats, instrument: str) -> Drive:
+    """Return the plan and the arm for compiled loops; the arguments are those of `execute`."""
+    plan, stamps = joints * _UNITS, stamps_s - stamps_s[0]
+    speeds = np.gradient(plan, stamps, axis=0) if servo.velocities and len(plan) > 1 else np.zeros_like(plan)
+    waves = np.concatenate([sin(plan[:, :2]), cos(plan[:, :2])], axis=1)
+    parts = np.concatenate([arm, [instrument_of(instrument).arm.effort]])
+    stream = np.array([servo.step_s, servo.rate_hz, servo.delay_s])
+    return Drive(stamps, plan, speeds, waves, _LOADS.copy(), parts, stream, np.zeros(1, np.int64))
+
+
 def execute(joints: Floats, stamps_s: Floats, servo: Servo, arm: Floats, instrument: str) -> Executed:
     """Return the motion of one arm.
 
@@ -240,22 +277,87 @@ def execute(joints: Floats, stamps_s: Floats, servo: Servo, arm: Floats, instrum
         arm: The arm, as by `Servo.arm`.
         instrument: Number of the instrument, whose greatest efforts count.
     """
-    plan, stamps = joints * _UNITS, stamps_s - stamps_s[0]
-    speeds = np.gradient(plan, stamps, axis=0) if servo.velocities and len(plan) > 1 else np.zeros_like(plan)
-    waves = np.concatenate([sin(plan[:, :2]), cos(plan[:, :2])], axis=1)
-    motor, link, effort, friction, load = np.zeros((5, *plan.shape))
-    share, stiffness = arm[6] - arm[7], arm[0]
-    motor[0] = plan[0]
+    drive = drive_of(joints, stamps_s, servo, arm, instrument)
+    plan, share, stiffness = drive.plan, arm[6] - arm[7], arm[0]
+    motor, (link, effort, friction) = np.zeros((len(plan), 2, 6)), np.zeros((3, *plan.shape))
+    rest = plan[:1].copy()
     for _ in range(5):  # a fixed point: the load changes with the droop by less than a tenth of it
-        load[0] = loads(motor[:1] / _UNITS)[0]
-        motor[0] = plan[0] - share * load[0] / stiffness
-    link[0], effort[0] = motor[0], arm[6] * load[0]
-    stream = np.array([servo.step_s, servo.rate_hz, servo.delay_s])
-    parts = np.concatenate([arm, [instrument_of(instrument).arm.effort]])
-    state = np.array([motor[0], np.zeros(6)])
-    _run(stamps, plan, speeds, waves, _LOADS.copy(), parts, stream, state, motor, link, effort, friction, load)
-    droop, stick = -share * load / stiffness, (link - motor) - friction / stiffness
-    return Executed(link / _UNITS, effort, droop / _UNITS, (link - plan - droop - stick) / _UNITS, stick / _UNITS)
+        rest = plan[:1] - share * loads(rest / _UNITS) / stiffness
+    motor[0, 0], link[0], effort[0] = rest[0], rest[0], arm[6] * loads(rest / _UNITS)[0]
+    _run(drive, motor[0].copy(), np.zeros((3, 6)), motor, link, effort, friction)
+    droop = -share * loads(motor[:, 0] / _UNITS) / stiffness
+    stick = (link - motor[:, 0]) - friction / stiffness
+    lag = link - plan - droop - stick
+    return Executed(link / _UNITS, effort, droop / _UNITS, lag / _UNITS, stick / _UNITS, motor)
+
+
+@inner
+def _push(drive: Drive, k: int, now: float, h: float, state: Floats, put: Floats) -> None:
+    """Fill in speeds after a step, efforts and dry friction, (3, 6), from places and speeds in its middle, (2, 6).
+
+    The step ends at or before sample `k`, its middle is at `now`, it has the length `h`; `now` never decreases.
+    """
+    rate, delay, known = drive.stream[1], drive.stream[2], int(drive.known[0])
+    stamps, plan, speeds, parts = drive.stamps, drive.plan, drive.speeds, drive.parts
+    # The setpoint that is in force, of the last tick of its stream that has arrived.
+    sent = max(np.floor((now - delay) * rate + 1e-6) / rate, 0.0)
+    while known < len(stamps) - 2 and stamps[known + 1] <= sent:
+        known += 1
+    drive.known[0] = known
+    way = min((sent - stamps[known]) / (stamps[known + 1] - stamps[known]), 1.0)
+    # Sines and cosines of the posture, from those of the plan and a small turn.
+    a = min(max(state[0, 0] - plan[k, 0], -1.0), 1.0)
+    b = min(max(state[0, 1] - plan[k, 1], -1.0), 1.0)
+    sin_a, cos_a = a - a * a * a / 6, 1 - a * a / 2 + a * a * a * a / 24
+    sin_b, cos_b = b - b * b * b / 6, 1 - b * b / 2 + b * b * b * b / 24
+    waves, factors = drive.waves, drive.factors
+    s1, c1 = waves[k, 0] * cos_a + waves[k, 2] * sin_a, waves[k, 2] * cos_a - waves[k, 0] * sin_a
+    s2, c2 = waves[k, 1] * cos_b + waves[k, 3] * sin_b, waves[k, 3] * cos_b - waves[k, 1] * sin_b
+    depth = state[0, 2]
+    for j in range(6):
+        load = 0.0
+        if j < 3:
+            load = factors[j, 0] + factors[j, 1] * s1 + factors[j, 2] * c1 + factors[j, 3] * s2 * c1
+            load += factors[j, 4] * c2 * c1 + factors[j, 5] * depth * s1
+            load += factors[j, 6] * depth * s2 * c1 + factors[j, 7] * depth
+        x, v, limit = state[0, j], state[1, j], parts[8, j]
+        wanted = plan[known, j] + way * (plan[known + 1, j] - plan[known, j])
+        speed = speeds[known, j] + way * (speeds[known + 1, j] - speeds[known, j])
+        e = parts[0, j] * (wanted - x) + parts[1, j] * speed + parts[7, j] * load
+        brake, rubs = parts[1, j] + parts[3, j], parts[4, j]
+        for again in range(2):
+            # From the effort at mean speed. Dry friction takes away what speed it can, and turns none round.
+            mass = parts[2, j] + h * brake / 2
+            free = ((parts[2, j] - h * brake / 2) * v + h * (e - parts[6, j] * load)) / mass
+            taken = min(max(free, -h * rubs / mass), h * rubs / mass)
+            if again == 0:
+                e -= parts[1, j] * (v + free - taken) / 2
+                if abs(e) <= limit:
+                    break
+                e, brake = min(max(e, -limit), limit), parts[3, j]
+        put[0, j], put[1, j], put[2, j] = free - taken, e, taken * mass / h
+
+
+@compiled
+def torques(k: int, now: float, h: float, masses: Floats, state: Floats, put: Floats, *known: Any) -> None:
+    """Fill in forces that move bodies of a mass matrix (6, 6) by the law, Nm and N, then as `_push`, and the speeds.
+
+    Who pushes a body off leaves it with other speeds than those, (4, 6), for which it was braked: that is given back.
+    """
+    drive = Drive(*known)  # known to numba as arrays, which it takes in half the time
+    for j in range(6):
+        put[3, j] -= state[1, j]
+    _push(drive, k, now, h, state, put)
+    for j in range(6):
+        lost, put[3, j] = put[3, j] / 2, put[0, j]
+        put[0, j] = (put[0, j] - state[1, j]) / h + (drive.parts[1, j] + drive.parts[3, j]) * lost / drive.parts[2, j]
+        put[1, j] += drive.parts[1, j] * lost
+    for j in range(6):
+        state[0, j] = 0.0
+        for i in range(6):
+            state[0, j] += masses[j, i] * put[0, i]
+    for j in range(6):
+        put[0, j] = state[0, j]
 
 
 class MovingArm:
@@ -271,8 +373,8 @@ class MovingArm:
         """Place an arm, the middle of a servo's ranges, at rest; rate and delay of its setpoints are the bus's own."""
         self.joints = frozen(joints, np.float64, (6,), "joints")
         self.speeds, self.efforts = np.zeros(6), np.zeros(6)
-        self._parts = np.concatenate([servo.arm(0.5, 0.5), [instrument_of(instrument).arm.effort]])
-        self._state, self._step_s = np.array([self.joints * _UNITS, np.zeros(6)]), servo.step_s
+        self._servo, self._arm, self._instrument = servo, servo.arm(0.5, 0.5), instrument
+        self._state = np.array([self.joints * _UNITS, np.zeros(6)])
 
     def move(self, wanted: Floats, speeds: Floats, seconds: float) -> None:
         """Move for some seconds under one setpoint.
@@ -282,84 +384,35 @@ class MovingArm:
             speeds: Their speeds, per second; 0 where none are sent.
             seconds: How long, above 0.
         """
-        plan = np.tile(wanted * _UNITS, (2, 1))
-        waves = np.concatenate([sin(plan[:, :2]), cos(plan[:, :2])], axis=1)
-        motor, link, effort, friction, load = np.zeros((5, 2, 6))
+        drive = drive_of(
+            np.tile(wanted, (2, 1)), np.array([0.0, seconds]), self._servo, self._arm, self._instrument
+        )._replace(speeds=np.tile(speeds * _UNITS, (2, 1)), stream=np.array([self._servo.step_s, 1.0 / seconds, 0.0]))
+        motor, (link, effort, friction) = np.zeros((2, 2, 6)), np.zeros((3, 2, 6))
         link[0] = self.joints * _UNITS
-        stamps, stream = np.array([0.0, seconds]), np.array([self._step_s, 1.0 / seconds, 0.0])
-        parts, state = self._parts, self._state
-        given = np.tile(speeds * _UNITS, (2, 1))
-        _run(stamps, plan, given, waves, _LOADS.copy(), parts, stream, state, motor, link, effort, friction, load)
-        self.joints, self.speeds, self.efforts = link[1] / _UNITS, state[1] / _UNITS, effort[1]
+        _run(drive, self._state, np.zeros((3, 6)), motor, link, effort, friction)
+        self.joints, self.speeds, self.efforts = link[1] / _UNITS, motor[1, 1] / _UNITS, effort[1]
 
 
 @compiled
 def _run(
-    stamps: Floats,
-    plan: Floats,
-    speeds: Floats,
-    waves: Floats,
-    factors: Floats,
-    parts: Floats,
-    stream: Floats,
-    state: Floats,
-    motor: Floats,
-    link: Floats,
-    effort: Floats,
-    friction: Floats,
-    weight: Floats,
+    drive: Drive, state: Floats, put: Floats, motor: Floats, link: Floats, effort: Floats, friction: Floats
 ) -> None:
-    """Fill in motors, links, efforts, dry friction and loads, (T, 6), from their first rows; `state`: place, speed."""
-    step, rate, delay = stream[0], stream[1], stream[2]
-    known = 0
-    for k in range(1, len(stamps)):
-        gap = stamps[k] - stamps[k - 1]
-        steps = int(np.ceil(gap / step - 1e-6))
+    """Fill in motors (T, 2, 6), links, efforts and dry friction, (T, 6), from their first rows; `state`: (2, 6)."""
+    for k in range(1, len(link)):
+        gap = drive.stamps[k] - drive.stamps[k - 1]
+        steps = int(np.ceil(gap / drive.stream[0] - 1e-6))
         h = gap / steps
         for i in range(steps):
-            # The setpoint that is in force, of the last tick of its stream that has arrived.
-            sent = max(np.floor((stamps[k - 1] + (i + 0.5) * h - delay) * rate + 1e-6) / rate, 0.0)
-            while known < len(stamps) - 2 and stamps[known + 1] <= sent:
-                known += 1
-            way = min((sent - stamps[known]) / (stamps[known + 1] - stamps[known]), 1.0)
             for j in range(6):
                 state[0, j] += h / 2 * state[1, j]  # to the middle of the step
-            # Sines and cosines of the posture, from those of the plan and a small turn.
-            a = min(max(state[0, 0] - plan[k, 0], -1.0), 1.0)
-            b = min(max(state[0, 1] - plan[k, 1], -1.0), 1.0)
-            sin_a, cos_a = a - a * a * a / 6, 1 - a * a / 2 + a * a * a * a / 24
-            sin_b, cos_b = b - b * b * b / 6, 1 - b * b / 2 + b * b * b * b / 24
-            s1, c1 = waves[k, 0] * cos_a + waves[k, 2] * sin_a, waves[k, 2] * cos_a - waves[k, 0] * sin_a
-            s2, c2 = waves[k, 1] * cos_b + waves[k, 3] * sin_b, waves[k, 3] * cos_b - waves[k, 1] * sin_b
-            depth = state[0, 2]
+            _push(drive, k, drive.stamps[k - 1] + (i + 0.5) * h, h, state, put)
             for j in range(6):
-                load = 0.0
-                if j < 3:
-                    load = factors[j, 0] + factors[j, 1] * s1 + factors[j, 2] * c1 + factors[j, 3] * s2 * c1
-                    load += factors[j, 4] * c2 * c1 + factors[j, 5] * depth * s1
-                    load += factors[j, 6] * depth * s2 * c1 + factors[j, 7] * depth
-                x, v, limit = state[0, j], state[1, j], parts[8, j]
-                wanted = plan[known, j] + way * (plan[known + 1, j] - plan[known, j])
-                speed = speeds[known, j] + way * (speeds[known + 1, j] - speeds[known, j])
-                e = parts[0, j] * (wanted - x) + parts[1, j] * speed + parts[7, j] * load
-                brake, rubs = parts[1, j] + parts[3, j], parts[4, j]
-                for again in range(2):
-                    # From the effort at mean speed. Dry friction takes away what speed it can, and turns none round.
-                    mass = parts[2, j] + h * brake / 2
-                    free = ((parts[2, j] - h * brake / 2) * v + h * (e - parts[6, j] * load)) / mass
-                    taken = min(max(free, -h * rubs / mass), h * rubs / mass)
-                    if again == 0:
-                        e -= parts[1, j] * (v + free - taken) / 2
-                        if abs(e) <= limit:
-                            break
-                        e, brake = min(max(e, -limit), limit), parts[3, j]
-                state[0, j] = x + h / 2 * (free - taken)
-                state[1, j] = free - taken
-                if i == steps - 1:
-                    effort[k, j], friction[k, j], weight[k, j] = e, taken * mass / h, load
+                state[1, j] = put[0, j]
+                state[0, j] += h / 2 * state[1, j]
         for j in range(6):
-            motor[k, j] = state[0, j]
-            link[k, j] = min(max(link[k - 1, j], state[0, j] - parts[5, j]), state[0, j] + parts[5, j])
+            motor[k, 0, j], motor[k, 1, j] = state[0, j], state[1, j]
+            effort[k, j], friction[k, j] = put[1, j], put[2, j]
+            link[k, j] = min(max(link[k - 1, j], state[0, j] - drive.parts[5, j]), state[0, j] + drive.parts[5, j])
 
 
 def levers_mm(joints: Floats, instrument: str = DEFAULT_INSTRUMENT) -> Floats:

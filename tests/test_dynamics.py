@@ -247,37 +247,41 @@ def test_an_independent_integration_has_the_same_motion(servo):
     assert np.linalg.norm(tips[1] - tips[2], axis=1).max() < 0.01 * np.linalg.norm(tips[1] - tips[0], axis=1).max()
 
 
-@pytest.mark.needs("mujoco")
-@pytest.mark.parametrize("servo", [Servo(play=NONE), Servo(play=NONE, velocities=False, gravity_compensated=True)])
-def test_mujoco_has_the_same_motion_within_a_hundredth(servo):
+def in_mujoco(joints: np.ndarray, stamps: np.ndarray, servo: Servo, begin: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return the executed joints in rad and mm, the motors' without play, of six hinges with rotors in MuJoCo."""
     import mujoco
 
-    joints, stamps = swaying(seconds=1.5)
-    arm = servo.arm(0.5, 0.5)
-    p, d, inertia, viscous, dry, _, load, compensated = arm
-    ours = execute(joints, stamps, servo, arm, "400006")
-    step = 1 / 9600.0
+    p, d, inertia, viscous, dry, _, load, compensated = servo.arm(0.5, 0.5)
     bodies = "".join(
         f'<body><joint type="hinge" axis="0 0 1" armature="{inertia[j]}" '
         f'damping="{viscous[j]}" frictionloss="{dry[j]}" solimpfriction="0.9999 0.9999 0.001" '
         f'solreffriction="0.0005 1"/><inertial pos="0 0 0" mass="1e-9" diaginertia="1e-9 1e-9 1e-9"/></body>'
         for j in range(6)
     )
-    text = f'<mujoco><option timestep="{step}" gravity="0 0 0" integrator="implicitfast"/><worldbody>{bodies}'
+    text = f'<mujoco><option timestep="{1 / rate_hz}" gravity="0 0 0" integrator="implicitfast"/><worldbody>{bodies}'
     model = mujoco.MjModel.from_xml_string(text + "</worldbody></mujoco>")
     data = mujoco.MjData(model)
-    data.qpos[:] = ours.joints[0] * [1, 1, 1e-3, 1, 1, 1]
+    data.qpos[:] = begin * [1, 1, 1e-3, 1, 1, 1]
     orders = list(setpoints(joints, stamps, servo))
     starts = np.array([one[0] for one in orders])
-    theirs = np.tile(ours.joints[0], (len(stamps), 1))
+    found = np.tile(begin, (len(stamps), 1))
     for k in range(1, len(stamps)):
-        for i in range(40):
-            now = stamps[k - 1] + i * step
+        for i in range(round((stamps[k] - stamps[k - 1]) * rate_hz)):
+            now = stamps[k - 1] + i / rate_hz
             _, _, wanted, speed = orders[int(np.searchsorted(starts, now + 1e-9)) - 1]
             acts = p * (wanted - data.qpos) + d * (speed - data.qvel)
             data.qfrc_applied[:] = acts + (compensated - load) * held_load(data.qpos)
             mujoco.mj_step(model, data)
-        theirs[k] = data.qpos / [1, 1, 1e-3, 1, 1, 1]
+        found[k] = data.qpos / [1, 1, 1e-3, 1, 1, 1]
+    return found
+
+
+@pytest.mark.needs("mujoco")
+@pytest.mark.parametrize("servo", [Servo(play=NONE), Servo(play=NONE, velocities=False, gravity_compensated=True)])
+def test_mujoco_has_the_same_motion_within_a_hundredth(servo):
+    joints, stamps = swaying(seconds=1.5)
+    ours = execute(joints, stamps, servo, servo.arm(0.5, 0.5), "400006")
+    theirs = in_mujoco(joints, stamps, servo, ours.joints[0], 9600.0)
     error = np.sqrt(np.mean((theirs - joints) ** 2, axis=0))
     apart = np.sqrt(np.mean((theirs - ours.joints) ** 2, axis=0))
     assert (apart < 0.01 * error).all(), apart / error

@@ -59,7 +59,7 @@ def test_a_verdict_names_its_first_failure_and_what_was_not_measured(values):
     report = values["Verdict"]
     assert "Verdict: feasible" in report._repr_html_()
     failure = Failure(7, 0, 0, 0.035, HOSTILE, 3.0, 2.0, "mm", 4.0, 0.05)
-    html = replace(report, feasible=False, failure=failure, goal_error_mm=float("nan"))._repr_html_()
+    html = replace(report, feasible=False, failure=failure, executed_off_mm=float("nan"))._repr_html_()
     assert "Verdict: not feasible" in html
     assert escape(str(failure)) in html
     assert "not measured" in html

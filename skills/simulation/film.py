@@ -149,7 +149,7 @@ def film(given: BinaryIO, answer: BinaryIO) -> None:
     os.nice(_NICENESS)
     asked = packing.read(given, CLASSES)
     assert isinstance(asked, FilmRequest)
-    with simulator.opened(asked.trajectory.instrument, asked.trajectory.rate_hz) as scene:
+    with simulator.opened(asked.trajectory.instrument) as scene:
         made = Film(*encode(_frames(scene, asked)))
     packing.write(answer, made, CLASSES)
 

@@ -2,13 +2,13 @@
 
 import re
 from dataclasses import fields, replace
-from math import isfinite
 from typing import TypeVar
 
 import numpy as np
 
 from skills import packing
 from skills.arrays import Floats, Ints
+from skills.dynamics import Servo
 from skills.errors import BadInput, SimulationFailed, Unanswered
 from skills.kinematics import JAW_TIP_MM, matrix_of
 from skills.planning.handoff import HOLDING_RAD
@@ -40,6 +40,7 @@ _ADVICE = {
 def play(
     trajectory: Trajectory,
     *,
+    servo: Servo | None = None,
     pad_top_mm: float | None = None,
     clearance_every: int = CLEARANCE_EVERY,
     timeout_s: float = 60.0,
@@ -49,10 +50,11 @@ def play(
     """Play a trajectory in a separate process and return the measurements.
 
     PSM_M is in the scene if the trajectory has its motion. The same trajectory gives the same measurements to the last
-    bit, except `seconds_per_step`.
+    bit.
 
     Args:
         trajectory: The trajectory to play.
+        servo: How the arm is driven; None: its motion is not executed.
         pad_top_mm: Height of the suture pad's top in the PSM base frame; by default `PAD_BELOW_MM` under the lowest
             finger tip (`default_pad_top`).
         clearance_every: Distances are measured once in so many samples; also at the first and last of each phase, and
@@ -76,7 +78,7 @@ def play(
     if target == SIMULATOR:
         simulator.require_pybullet()
     limits = ProcessLimits(memory_bytes, timeout_s)
-    playback = simulated(target, request(trajectory, pad, clearance_every), Playback, CLASSES, limits)
+    playback = simulated(target, request(trajectory, pad, clearance_every, servo), Playback, CLASSES, limits)
     try:
         mine = replace(playback, trajectory=trajectory)  # checks all shapes again
     except BadInput as error:
@@ -99,11 +101,10 @@ def _check(playback: Playback) -> None:
         _FILE.fullmatch(name) and _DIGEST.fullmatch(digest) for name, digest in playback.files.items()
     )
     pictured = isinstance(playback.picture_png, bytes) and playback.picture_png.startswith(_PNG)
-    timed = isinstance(playback.seconds_per_step, float) and isfinite(playback.seconds_per_step)
     engine = isinstance(playback.engine, str) and 0 < len(playback.engine) <= 100
     both = (playback.psm_m_tip_mm is None) == (playback.trajectory.psm_m is None)
-    if not (named and pictured and timed and engine and both):
-        raise _nonsense("the picture, the engine, its files, the time of a step or the arms.")
+    if not (named and pictured and engine and both):
+        raise _nonsense("the picture, the engine, its files or the arms.")
 
 
 def _nonsense(why: str) -> SimulationFailed:
@@ -155,6 +156,8 @@ def simulated(
         raise error.translated(SimulationFailed, "The simulator", _ADVICE) from error.__cause__
 
 
-def request(trajectory: Trajectory, pad_top_mm: float, every: int = CLEARANCE_EVERY) -> PlayRequest:
+def request(
+    trajectory: Trajectory, pad_top_mm: float, every: int = CLEARANCE_EVERY, servo: Servo | None = None
+) -> PlayRequest:
     """Return the request for the simulator."""
-    return PlayRequest(trajectory, pad_top_mm, looks(trajectory, every))
+    return PlayRequest(trajectory, pad_top_mm, looks(trajectory, every), servo)

@@ -7,23 +7,25 @@ their measurements, file to file:
 * kinematic: the joints are set exactly to their commanded values; we read back the joints, the frame of the link
   `tool_frame` and, at every few samples, the distances between links. Where distances are small or the arms may have
   come near between two measurements, every sample is measured.
-* servo: the motors follow under gravity with the arm's real greatest efforts, PSM_A alone with the pad. The motor's law
-  is v = gain (q_target - q) / dt + v_target; with the position at the start of the step as target, and the speed of
-  that step, it is exact.
+* torque, where a servo is stated: PSM_A moves by the torques of `skills.dynamics`, at 1 kHz or more, in windows in
+  which it may touch the pad or PSM_M, both rigid, which goes on as planned. Elsewhere the compiled motion stands. The
+  fitted load stands for gravity and cables, so gravity is off; links have the inertias of their motors, for which the
+  servo's step is short enough; jaws do not give way; and the play is added after, so the motors' places are those that
+  touch. Forces are those of the last step before a sample.
 
 The inner loops use lists and PyBullet's units: its calls take microseconds, and so would the creation of each small
 array.
 """
 
 import importlib.util
-import time
 from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from importlib.metadata import version
 from importlib.resources import files
+from math import ceil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
@@ -33,21 +35,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skills import packing
-from skills.arrays import Floats, Ints
+from skills.arrays import Flags, Floats, Ints
+from skills.dynamics import Drive, Executed, Prediction, Servo, drive_of, predict, torques
 from skills.errors import SimulationFailed
-from skills.kinematics import INSERTION, JOINTS, InstrumentConstants, instrument_of, matrix_of
+from skills.kinematics import INSERTION, JOINTS, InstrumentConstants, axes_of, forward, instrument_of, matrix_of
 from skills.planning.handoff import HELD_MM, HOLDING_RAD, OPEN_RAD, OtherArm
-from skills.planning.motion_laws import A1, Poses
+from skills.planning.motion_laws import A1, A2, Poses
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
 from skills.simulation import pictures
-from skills.verification.clearance import Bounds
+from skills.verification.clearance import Bounds, travel_mm
 from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, PAD, Playback, link_pairs, pad_scale
 
 MM = 1e-3
 PLACE, TURN = 4, 5  # indices of the frame in a link's state; 0 and 1 would be its centre of mass
-EFFORT = 3  # index of the effort in a joint's state
-POSITION_GAIN, VELOCITY_GAIN = 0.3, 1.0
-FINGER_EFFORT = 0.16  # Nm
+FORCE = 9  # index of the force in a contact
+LIGHT_KG, LIGHT_KG_M2 = 1e-4, 1e-7  # ours: of a link beside its motor, a thousandth of it and less
+HEAVY_KG = 1e3  # ours: what touches PSM_M does not move it
+BALANCED_MM = 120.0  # insertion at which the insertion's mass is at the remote centre in `urdf/psm.urdf`
+WINDOW_S = 0.3  # ours: five times 2 I / D of yaw; so long after a contact less than a hundredth of its push is left
 URDF_CENTRE_MM, URDF_WRIST_MM = 431.8, 15.6  # remote centre and wrist offset of `urdf/psm.urdf`
 PSM_M_COLOUR = (0.35, 0.55, 0.35, 1.0)
 LOOK_CLOSER_MM = 2.0  # ours: twice the gates' distances; nearer than this, every sample is measured
@@ -55,11 +60,12 @@ LOOK_CLOSER_MM = 2.0  # ours: twice the gates' distances; nearer than this, ever
 
 @dataclass(frozen=True, eq=False)
 class PlayRequest:
-    """A trajectory, the height of the pad in mm, and the samples at which distances are measured first."""
+    """A trajectory, the height of the pad in mm, the samples at which distances are measured first, and the servo."""
 
     trajectory: Trajectory
     pad_top_mm: float
     looks: Ints
+    servo: Servo | None = None
 
 
 class KinematicPass(NamedTuple):
@@ -74,16 +80,7 @@ class KinematicPass(NamedTuple):
     psm_m_tip_mm: Floats | None
 
 
-class ServoPass(NamedTuple):
-    """The measurements of the servo pass, likewise."""
-
-    tracking_mm: Floats
-    efforts: Floats
-    contact_n: Floats
-    seconds_per_step: float
-
-
-CLASSES = packing.known(PlayRequest, Trajectory, OtherArm, Poses, Playback)
+CLASSES = packing.known(PlayRequest, Trajectory, OtherArm, Poses, Servo, Playback)
 
 
 def require_pybullet() -> None:
@@ -101,7 +98,7 @@ def require_pybullet() -> None:
 
 
 @contextmanager
-def opened(instrument: str, rate_hz: float) -> Iterator["Simulator"]:
+def opened(instrument: str) -> Iterator["Simulator"]:
     """Open a fresh scene with PSM_A, and close it at the end; a fresh one gives the same numbers each time."""
     require_pybullet()
     import pybullet
@@ -109,8 +106,6 @@ def opened(instrument: str, rate_hz: float) -> Iterator["Simulator"]:
 
     bullet = BulletClient(pybullet.DIRECT)
     try:
-        bullet.setTimeStep(1.0 / rate_hz)
-        bullet.setGravity(0, 0, -9.81)
         bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         yield Simulator(bullet, instrument_of(instrument))
     finally:
@@ -130,7 +125,7 @@ class SceneBody:
 
 
 class Simulator:
-    """One simulation. Lengths in arguments are in mm, except in `drive` and in cameras, which use PyBullet's metres."""
+    """One simulation. Lengths in arguments are in mm, except in cameras, which use PyBullet's metres."""
 
     def __init__(self, bullet: Any, tool: InstrumentConstants) -> None:
         self.bullet = bullet
@@ -140,9 +135,7 @@ class Simulator:
         self.pad_mm = np.zeros(3)
         self.psm_m: SceneBody | None = None
         self.needle: int | None = None
-        self._driven = [*self.arm.joints, *self.arm.fingers]
-        self._efforts = [*tool.arm.effort, FINGER_EFFORT, FINGER_EFFORT]
-        self._position_gains, self._velocity_gains = [POSITION_GAIN] * 8, [VELOCITY_GAIN] * 8
+        self._balanced_mm = BALANCED_MM + tool.wrist_offset_mm - URDF_WRIST_MM
 
     # -- contents --
 
@@ -162,22 +155,20 @@ class Simulator:
         self.pad = self._load("suture_pad.urdf", self.pad_mm, quaternion, scale=pad_scale(tip_mm))
 
     def place_psm_m(self, base_mm: Floats, base_xyzw: Floats, tool: InstrumentConstants) -> None:
-        """Load PSM_M, in green and with its jaws open.
+        """Load PSM_M, in green and with its jaws open, and so heavy that it goes on as it is moved."""
+        self.psm_m = m = self._load_arm(base_mm, base_xyzw, tool, OPEN_RAD)
+        for link in range(self.bullet.getNumJoints(m.number)):
+            self.bullet.changeDynamics(m.number, link, mass=HEAVY_KG, localInertiaDiagonal=[HEAVY_KG] * 3)
+            self.bullet.changeVisualShape(m.number, link, rgbaColor=PSM_M_COLOUR)
+        self.bullet.setJointMotorControlArray(m.number, m.joints, self.bullet.VELOCITY_CONTROL, forces=[0.0] * 6)
 
-        Collisions between the arms are off, because their distance is measured instead.
-        """
-        self.psm_m = self._load_arm(base_mm, base_xyzw, tool, OPEN_RAD)
-        links = range(-1, self.bullet.getNumJoints(self.psm_m.number))
-        for link in links:
-            for own in links:
-                self.bullet.setCollisionFilterPair(self.arm.number, self.psm_m.number, own, link, 0)
-            self.bullet.changeVisualShape(self.psm_m.number, link, rgbaColor=PSM_M_COLOUR)
-
-    def pose(self, joints: Floats, body: SceneBody | None = None) -> None:
-        """Set an arm's joints (rad, insertion mm) exactly, at rest."""
-        arm = body or self.arm
+    def pose(self, joints: Floats, body: SceneBody | None = None, speeds: Floats | None = None) -> None:
+        """Set an arm's joints (rad, insertion mm) exactly, at rest or with speeds."""
+        arm, moving = body or self.arm, np.zeros(6) if speeds is None else in_metres(speeds)
         # One call for all joints takes a fifth of the time of one call for each.
-        self.bullet.resetJointStatesMultiDof(arm.number, arm.joints, in_metres(joints)[:, None].tolist())
+        self.bullet.resetJointStatesMultiDof(
+            arm.number, arm.joints, in_metres(joints)[:, None].tolist(), moving[:, None].tolist()
+        )
 
     def show(self, trajectory: Trajectory, sample: int) -> None:
         """Set the joints of the arms in the scene to those of a sample."""
@@ -206,28 +197,40 @@ class Simulator:
         return self.bullet.getClosestPoints(body, other, CLEARANCE_SEEN_MM * MM)
 
     def pressed_n(self) -> float:
-        """Return the force of the pad on PSM_A, N."""
-        points = self.bullet.getContactPoints(self.arm.number, self.pad)
-        return float(sum(point[9] for point in points))
+        """Return the force of all that touches PSM_A, N."""
+        return float(sum(point[FORCE] for point in self.bullet.getContactPoints(self.arm.number)))
 
-    def drive(self, start: list[float], velocity: list[float]) -> None:
-        """Let the motors move PSM_A through one time step that begins at `start`.
+    def weigh(self, inertia: Floats, joints: Floats) -> Floats:
+        """Turn PSM_A's motors off, and give each link the inertia of its motor about its own joint's axis.
+
+        PyBullet knows no rotors beside the links. So a link also resists the joints before its own, and the insertion's
+        mass swings where it is not at the remote centre: for that, which the mass matrices have, torques must allow.
 
         Args:
-            start: Joints and fingers in PyBullet's units (`in_metres`), 8 numbers.
-            velocity: Their speeds in this step.
+            inertia: That of each joint, kg m2 and kg, shape (6,).
+            joints: The places between which it then moves, rad and mm, shape (K, 6).
+
+        Returns:
+            The resulting mass matrices there, shape (K, 6, 6).
         """
-        self.bullet.setJointMotorControlArray(
-            self.arm.number,
-            self._driven,
-            self.bullet.POSITION_CONTROL,
-            targetPositions=start,
-            targetVelocities=velocity,
-            forces=self._efforts,
-            positionGains=self._position_gains,
-            velocityGains=self._velocity_gains,
-        )
-        self.bullet.stepSimulation()
+        bullet, arm = self.bullet, self.arm
+        away_m = (joints[:, INSERTION] - self._balanced_mm) * MM
+        own = inertia.copy()
+        own[:2] -= inertia[INSERTION] * away_m.mean() ** 2
+        for link in range(bullet.getNumJoints(arm.number)):
+            bullet.changeDynamics(arm.number, link, mass=LIGHT_KG, localInertiaDiagonal=[LIGHT_KG_M2] * 3)
+        for joint, link in enumerate(arm.joints):
+            mass = own[joint] if joint == INSERTION else LIGHT_KG
+            turning = LIGHT_KG_M2 if joint == INSERTION else own[joint]
+            bullet.changeDynamics(arm.number, link, mass=mass, localInertiaDiagonal=[LIGHT_KG_M2, LIGHT_KG_M2, turning])
+        bullet.setJointMotorControlArray(arm.number, arm.joints, bullet.VELOCITY_CONTROL, forces=[0.0] * 6)
+        axes = _axes(joints)
+        along = np.tril(axes @ np.swapaxes(axes, 1, 2))
+        along[:, INSERTION, INSERTION] = 1.0  # it slides
+        found = np.swapaxes(along, 1, 2) @ (own[:, None] * along)
+        for joint in range(2):
+            found[:, joint, joint] += inertia[INSERTION] * away_m**2 * (1 - along[:, INSERTION + 1, joint] ** 2)
+        return np.asarray(found)
 
     def photograph(self, camera: pictures.Camera, needle: tuple[Floats, Floats] | None = None) -> pictures.Photograph:
         """Return an image of the present scene, the needle in a given pose (mm, quaternion) or between PSM_A's jaws."""
@@ -336,6 +339,16 @@ def arm_in_capsules(text: str, wrist_mm: float) -> str:
     return ElementTree.tostring(root, "unicode")
 
 
+def _axes(joints: Floats) -> Floats:
+    """Return the directions of PSM_A's joints in its base frame, (K, 6, 3); 0 of the insertion, which slides."""
+    (s1, s6), (c1, c6) = (f(joints[:, (0, 5)]).T for f in (np.sin, np.cos))
+    shaft, _, rotation = axes_of(joints)
+    n, o, a = np.moveaxis(rotation, 2, 0)
+    still, one = np.zeros_like(s1), np.ones_like(s1)
+    yaw, pitch = np.stack([still, -one, still], axis=1), np.stack([-c1, still, -s1], axis=1)
+    return np.stack([yaw, pitch, 0 * shaft, shaft, -c6[:, None] * o - s6[:, None] * a, -n], axis=1)
+
+
 def in_metres(joints: Floats) -> Floats:
     """Return joints, shape (..., 6), in PyBullet's units: the insertion in metres."""
     values = np.array(joints, float)
@@ -351,25 +364,22 @@ def simulate(given: BinaryIO, answer: BinaryIO) -> None:
     asked = packing.read(given, CLASSES)
     assert isinstance(asked, PlayRequest)
     motion = asked.trajectory
-    with opened(motion.instrument, motion.rate_hz) as scene:
+    with opened(motion.instrument) as scene:
         scene.set_up(motion, asked.pad_top_mm)
         kinematic = kinematic_pass(scene, asked)
         scene.show(motion, _pictured(motion))
         picture = pictures.draw(scene.photograph, _paths(motion))
         files, pad_mm = dict(sorted(scene.files.items())), scene.pad_mm
-    # In a fresh scene: PSM_M would take two thirds of each step, and earlier contacts influence later steps.
-    with opened(motion.instrument, motion.rate_hz) as scene:
-        scene.place_pad(motion.tip_mm, asked.pad_top_mm)
-        servo = servo_pass(scene, motion)
     playback = Playback(
         trajectory=motion,
         **kinematic._asdict(),
-        **servo._asdict(),
         pad_mm=pad_mm,
         picture_png=picture,
         engine=f"PyBullet {version('pybullet')}",
         files=files,
     )
+    if asked.servo is not None:
+        playback = _executed(asked, asked.servo, playback)
     packing.write(answer, playback, CLASSES)
 
 
@@ -417,15 +427,16 @@ def _table(values: "array[float]", columns: int) -> Floats:
 
 def _closer(seen_mm: Floats, asked: PlayRequest) -> Ints:
     """Return the samples without a measurement at which links may be near each other."""
-    motion = asked.trajectory
-    moving = {PSM_A: (motion.joints, motion.instrument)}
-    if (m := motion.psm_m) is not None:
-        moving[PSM_M] = (m.joints, m.instrument)
-    bounds = Bounds.of(moving, link_pairs(m is not None), asked.looks, seen_mm)
-    near = np.zeros(len(motion), dtype=bool)
+    bounds, near = _bounds(asked.trajectory, asked.looks, seen_mm), np.zeros(len(asked.trajectory), dtype=bool)
     for column in range(len(bounds.pairs)):
         near |= bounds.at_least_mm(column) < LOOK_CLOSER_MM
     return np.setdiff1d(np.flatnonzero(near), asked.looks)
+
+
+def _bounds(motion: Trajectory, looked_at: Ints, seen_mm: Floats) -> Bounds:
+    """Return the bounds on distances at every sample, from those seen at some."""
+    moving = {arm.name: (arm.joints, arm.instrument) for arm in motion.arms}
+    return Bounds.of(moving, link_pairs(motion.psm_m is not None), looked_at, seen_mm)
 
 
 class _Distances:
@@ -482,30 +493,127 @@ def _pairs_of_bodies(scene: Simulator) -> dict[tuple[int, int], dict[tuple[int, 
     return found
 
 
-# ---- the servo pass --------------------------------------------------------------------------------------------
+# ---- the torque pass -------------------------------------------------------------------------------------------
 
 
-def servo_pass(scene: Simulator, motion: Trajectory) -> ServoPass:
-    """Let the motors follow, and measure the tip's error, the motors' efforts and the pad's force."""
-    wanted = np.pad(in_metres(motion.joints), ((0, 0), (0, 2)), constant_values=HOLDING_RAD)
-    velocities = np.diff(wanted, axis=0) * motion.rate_hz
-    scene.pose(motion.joints[0])
-    places, efforts, pressed = array("d"), array("d", [0.0] * 6), array("d", [0.0])
-    places.extend(scene.frame_of(scene.arm, scene.arm.tool)[0])
-    began = time.perf_counter()
-    for start, velocity in zip(_rows(wanted[:-1]), _rows(velocities), strict=True):
-        scene.drive(start, velocity)
-        a, b, c, d, e, f = scene.joint_states()
-        efforts.extend((a[EFFORT], b[EFFORT], c[EFFORT], d[EFFORT], e[EFFORT], f[EFFORT]))
-        places.extend(scene.frame_of(scene.arm, scene.arm.tool)[0])
+def windows_of(motion: Trajectory, predicted: Prediction, looked_at: Ints, seen_mm: Floats) -> Ints:
+    """Choose the windows that are stepped: wherever an arm of all ranges may touch something, and some more.
+
+    These are the hand-overs and the worst predicted error of each pass. Each window is longer by `WINDOW_S` either way.
+
+    Args:
+        motion: The planned motion.
+        predicted: The executed one, with its ranges.
+        looked_at: The samples at which distances were measured, shape (C,).
+        seen_mm: The distances there, shape (C, P).
+
+    Returns:
+        The first and the last sample of each window, in order and apart, shape (W, 2).
+    """
+    bounds, off_mm = _bounds(motion, looked_at, seen_mm), np.zeros((len(motion), len(LINKS)))
+    for arm in (predicted.executed, *predicted.others):
+        beside = np.stack([motion.joints, arm.joints], axis=1).reshape(-1, 6)
+        off_mm = np.maximum(off_mm, travel_mm(beside, motion.instrument)[::2])
+    marked = np.zeros(len(motion), dtype=bool)
+    for column, pair in enumerate(bounds.pairs):
+        if pair.body == PSM_A:
+            marked |= ~(bounds.at_least_mm(column) > off_mm[:, LINKS.index(pair.link)])
+    for number in range(motion.passes):
+        of_pass = np.flatnonzero(motion.pass_index == number)
+        marked[of_pass[predicted.off_mm[0, of_pass].argmax()]] = True
+    if motion.psm_m is not None:
+        marked[motion.last_samples[motion.phase[motion.last_samples] == A2]] = True
+    stamps, ends = motion.stamps_s, _stretches(marked)
+    first, last = np.searchsorted(stamps, [stamps[ends[:, 0]] - WINDOW_S, stamps[ends[:, 1]] + WINDOW_S])
+    covered = np.zeros(len(motion), dtype=bool)
+    for begin, end in zip(first.tolist(), last.tolist(), strict=True):
+        covered[begin : end + 1] = True
+    return _stretches(covered)
+
+
+def _stretches(marked: Flags) -> Ints:
+    """Return the first and the last sample of each stretch that is marked, shape (W, 2)."""
+    edges = np.diff(marked.astype(np.int8), prepend=0, append=0)
+    return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1], axis=1)
+
+
+def _executed(asked: PlayRequest, servo: Servo, played: Playback) -> Playback:
+    """Return a playback with the executed motion."""
+    motion = asked.trajectory
+    predicted = predict(motion.joints, motion.stamps_s, servo, motion.instrument)
+    windows = windows_of(motion, predicted, played.looked_at, played.clearances_mm)
+    with opened(motion.instrument) as scene:
+        scene.set_up(motion, asked.pad_top_mm)
+        joints, efforts, contact_n = torque_pass(scene, motion, servo, predicted.executed, windows)
+    tracking_mm = np.linalg.norm(forward(joints, motion.instrument)[0] - motion.tip_mm, axis=1)
+    return replace(played, tracking_mm=tracking_mm, efforts=efforts, contact_n=contact_n, windows=windows)
+
+
+def torque_pass(
+    scene: Simulator, motion: Trajectory, servo: Servo, executed: Executed, windows: Ints
+) -> tuple[Floats, Floats, Floats]:
+    """Move PSM_A by torques through windows of its executed motion, among things that it can touch.
+
+    Args:
+        scene: A fresh scene with these things.
+        motion: The planned motion.
+        servo: How the arm is driven.
+        executed: What the arm in the middle of all ranges does where it touches nothing.
+        windows: The first and the last sample of each window, shape (W, 2).
+
+    Returns:
+        The executed joints, rad and mm, shape (T, 6), PyBullet's inside of windows; efforts and forces of contact.
+    """
+    drive = drive_of(motion.joints, motion.stamps_s, servo, servo.arm(0.5, 0.5), motion.instrument)
+    joints, efforts, contact_n = executed.joints.copy(), executed.efforts.copy(), np.zeros(len(motion))
+    play = drive.parts[5] / in_metres(np.ones(6))
+    for first, last in windows.tolist():
+        inside = slice(first + 1, last + 1)
+        motors, efforts[inside], contact_n[inside] = _stepped(scene, motion, drive, executed.motors[first], first, last)
+        for k, motor in enumerate(motors, first + 1):
+            joints[k] = np.minimum(np.maximum(joints[k - 1], motor - play), motor + play)
+    return joints, efforts, contact_n
+
+
+def _stepped(
+    scene: Simulator, motion: Trajectory, drive: Drive, begin: Floats, first: int, last: int
+) -> tuple[Floats, Floats, Floats]:
+    """Step through a window that begins with these places and speeds of the motors, rad and m, shape (2, 6).
+
+    Returns:
+        Places of the motors, rad and mm, efforts, and the force of contact, of the samples after the first.
+    """
+    bullet, arm, m = scene.bullet, scene.arm, motion.psm_m
+    masses = scene.weigh(drive.parts[2], motion.joints[first : last + 1])
+    state, put, h = begin.copy(), np.tile(begin[1], (4, 1)), 0.0
+    motors, efforts, pressed = array("d"), array("d"), array("d")
+    act, step, read = bullet.setJointMotorControlArray, bullet.stepSimulation, bullet.getJointStates
+    number, joints, by_torque = arm.number, arm.joints, bullet.TORQUE_CONTROL
+    for k in range(first + 1, last + 1):
+        begun, mass = float(drive.stamps[k - 1]), masses[k - first]
+        gap = float(drive.stamps[k]) - begun
+        steps = ceil(gap / drive.stream[0] - 1e-6)
+        if abs(gap / steps - h) > 1e-9:
+            # PyBullet changes places after speeds, so what it calls places are those half a step later.
+            place, h = state[0] - h / 2 * state[1], gap / steps
+            bullet.setTimeStep(h)
+            state[0] = place + h / 2 * state[1]
+            bullet.resetJointStatesMultiDof(number, joints, state[0][:, None].tolist(), state[1][:, None].tolist())
+        if m is not None and scene.psm_m is not None:
+            scene.pose(m.joints[k - 1], scene.psm_m, (m.joints[k] - m.joints[k - 1]) / gap)
+        for i in range(steps):
+            torques(k, begun + (i + 0.5) * h, h, mass, state, put, *drive)
+            act(number, joints, by_torque, forces=put[0].tolist())
+            step()
+            a, b, c, d, e, f = read(number, joints)
+            state[0] = (a[0], b[0], c[0], d[0], e[0], f[0])
+            state[1] = (a[1], b[1], c[1], d[1], e[1], f[1])
+        motors.extend(state[0] - h / 2 * state[1])
+        efforts.extend(put[1])
         pressed.append(scene.pressed_n())
-    seconds = time.perf_counter() - began
-    return ServoPass(
-        tracking_mm=np.linalg.norm(_table(places, 3) / MM - motion.tip_mm, axis=1),
-        efforts=_table(efforts, 6),
-        contact_n=np.array(pressed),
-        seconds_per_step=seconds / max(1, len(velocities)),
-    )
+    places = _table(motors, 6)
+    places[:, INSERTION] /= MM
+    return places, _table(efforts, 6), np.array(pressed)
 
 
 # ---- the picture -----------------------------------------------------------------------------------------------

@@ -1,9 +1,9 @@
 """Playbacks: the simulator's measurements at the samples of a trajectory, and the pictures of a playback.
 
 `skills.simulation.player.play` returns a `Playback` of two passes over a trajectory: a kinematic pass, which sets the
-joints to those of the trajectory and measures tips and surfaces, and a servo pass, in which the joints' motors follow
-with the arm's real greatest efforts. `skills.verification.verdict.judge` compares it with the trajectory. All of this
-is ours; the paper played its plans on the robot.
+joints to those of the trajectory and measures tips and surfaces, and, where a servo is stated, a torque pass: the
+executed motion (`skills.dynamics`), among things that it can touch. `skills.verification.verdict.judge` compares it
+with the trajectory. All of this is ours; the paper played its plans on the robot.
 
 Distances take most of the simulator's time, so it does not measure them at every sample; between two measurements they
 are bounded by the distance that the arms can have moved (`skills.verification.clearance`).
@@ -36,7 +36,7 @@ MEANS = {
     "tip and rotation": "PyBullet's forward kinematics against the closed form",
     "shaft, wrist, fingers and pad": "PyBullet's distances between capsules, which are exact to 0.0001 mm as no convex "
     "hull is among them (hulls are up to 2 mm off); between two measurements a bound in closed form",
-    "servo, effort and force": "PyBullet's motors under gravity with the arm's greatest efforts, PSM_A alone",
+    "force of contact": "PyBullet's rigid contacts of the executed motion, where a servo is stated",
     "outer bodies": "closed form: capsules around published joint origins",
     "scene, tissue and needle": "closed form: capsules and the needle's arc",
     "what was asked": "closed form, computed anew from the request",
@@ -98,9 +98,6 @@ class Playback:
         tip_mm: Tip in the kinematic pass, PSM base frame, shape (T, 3).
         rotation_xyzw: The jaw's rotation there, shape (T, 4).
         joints: Joints of the kinematic pass, rad and mm, shape (T, 6).
-        tracking_mm: Distance of the servo pass's tip from the trajectory's, shape (T,).
-        efforts: Efforts of the motors in the servo pass, Nm and N, shape (T, 6).
-        contact_n: Force of the pad on the arm, N, shape (T,).
         looked_at: The samples at which distances were measured, ascending, shape (C,); they contain the first and the
             last of each phase, and every sample of a stretch in which surfaces come close.
         clearances_mm: Distances of `link_pairs` there, negative inside, shape (C, 4), or (C, 24) with PSM_M.
@@ -110,16 +107,17 @@ class Playback:
         picture_png: A still picture of the scene.
         engine: The simulator and its version.
         files: SHA-256 of each file from which the scene was made.
-        seconds_per_step: Wall time of one servo step: a timing, so it is not part of any report or digest.
+        tracking_mm: Distance of the executed tip from the trajectory's, shape (T,); None: no servo was stated.
+        efforts: Efforts of the motors then, Nm and N, shape (T, 6), or None.
+        contact_n: Force of pad and PSM_M on PSM_A then, N, shape (T,), or None.
+        windows: First and last sample of each stretch whose motion is PyBullet's, shape (W, 2), or None; elsewhere
+            PSM_A can touch nothing, and the compiled motion stands.
     """
 
     trajectory: Trajectory
     tip_mm: Floats
     rotation_xyzw: Floats
     joints: Floats
-    tracking_mm: Floats
-    efforts: Floats
-    contact_n: Floats
     looked_at: Ints
     clearances_mm: Floats
     shaft_off_mm: Floats
@@ -128,7 +126,10 @@ class Playback:
     picture_png: bytes
     engine: str
     files: Mapping[str, str]
-    seconds_per_step: float
+    tracking_mm: Floats | None = None
+    efforts: Floats | None = None
+    contact_n: Floats | None = None
+    windows: Ints | None = None
 
     def __post_init__(self) -> None:
         count, looks, pairs = len(self.trajectory), len(self.looked_at), len(self.link_pairs)
@@ -139,6 +140,7 @@ class Playback:
             "tracking_mm": (count,),
             "efforts": (count, 6),
             "contact_n": (count,),
+            "windows": (0 if self.windows is None else len(self.windows), 2),
             "looked_at": (looks,),
             "clearances_mm": (looks, pairs),
             "shaft_off_mm": (looks,),
@@ -165,7 +167,7 @@ class Playback:
 
 def _kept(values: ArrayLike, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
     """Return a read-only copy of an array; unlike `frozen` it permits NaN, which the gates then refuse."""
-    array = np.array(values, dtype=np.int64 if name == "looked_at" else np.float64, order="C", copy=True)
+    array = np.array(values, dtype=np.int64 if name in ("looked_at", "windows") else np.float64, order="C", copy=True)
     if array.shape != shape:
         raise BadInput(f"{name} has shape {array.shape}; give {shape}.", shape=array.shape)
     array.setflags(write=False)

@@ -7,9 +7,8 @@
 asked if its deviations from that are given (`skills.verification.intent`), by the gates of `skills.verification.gates`.
 All of this is ours; the paper played its plans on the robot.
 
-A feasible verdict means that the geometry is right and free. In free space the servo's error and efforts depend on the
-simulator's gains and masses, not on the robot's, so they guard against mistakes of ours and in contact; they are no
-evidence of the hardware's accuracy. PSM_M is in the kinematic pass alone.
+A feasible verdict means that the geometry is right and free, and, where a servo is stated, that the executed motion
+touches no harder than lightly.
 """
 
 from collections.abc import Mapping
@@ -113,7 +112,6 @@ class PassEnd:
         sample: Its index.
         turn_deg: Angle by which A2 turned the jaw.
         alignment_error_deg: Angle between the jaw's final and target rotations.
-        goal_error_mm: Distance of the servo's tip from the target.
         n_to_a_m_deg: Angle between PSM_A's hinge axis n and PSM_M's approach a_M; None if that is not known.
         a_to_a_m_deg: Angle between PSM_A's approach and a_M: the paper wants a right angle.
     """
@@ -121,7 +119,6 @@ class PassEnd:
     sample: Count
     turn_deg: Figure
     alignment_error_deg: Figure
-    goal_error_mm: Figure
     n_to_a_m_deg: Figure
     a_to_a_m_deg: Figure
 
@@ -144,9 +141,10 @@ class PlaybackReport:
     `least_margin` is the least distance of a joint of PSM_A, `least_margin_joint`, from its limit as a part of its
     range, and the peak ratios are PSM_A's; `arms` has every joint of both. `clearance_pad_mm` is of either arm. Between
     two measurements a pair of links can have come nearer by `moved_between_looks_mm`, which the gates take into
-    account. `peak_effort_ratio` is over the complete servo pass, `peak_contact_effort_ratio` over the samples in which
-    the arm touches the pad. `bodies` compares the arms' outer bodies. `intent` has the greatest deviation of each kind
-    from what was asked; null: not compared with it. `means` has for each check the means by which it is decided.
+    account. `executed_off_mm` is the greatest distance of the executed tip from the planned one, `peak_contact_n` the
+    greatest force on PSM_A then; null: no servo was stated. `bodies` compares the arms' outer bodies. `intent` has the
+    greatest deviation of each kind from what was asked; null: not compared with it. `means` has for each check the
+    means by which it is decided.
     """
 
     feasible: bool
@@ -165,12 +163,8 @@ class PlaybackReport:
     fk_error_deg: Figure
     psm_m_fk_error_mm: Figure
     shaft_off_mm: Figure
-    tracking_max_mm: Figure
-    tracking_rms_mm: Figure
-    goal_error_mm: Figure
+    executed_off_mm: Figure
     peak_contact_n: Figure
-    peak_effort_ratio: Figure
-    peak_contact_effort_ratio: Figure
     deviation_mm: Figure
     clearance_pad_mm: Figure
     clearance_psm_m_mm: Figure
@@ -199,8 +193,9 @@ class PlaybackReport:
             "least margin of a joint, as a part of its range": self.least_margin,
             "greatest speed, as a part of its limit": self.peak_speed_ratio,
             "greatest acceleration, as a part of its limit": self.peak_acceleration_ratio,
-            "greatest tracking error, mm": self.tracking_max_mm,
-            "error at the goal, mm": self.goal_error_mm,
+            "executed tip off the plan, mm": "no servo is stated"
+            if self.executed_off_mm is None
+            else self.executed_off_mm,
             "distance from the pad, mm": self.clearance_pad_mm,
             "distance from PSM_M, mm": self.clearance_psm_m_mm if self.psm_m_in_scene else "PSM_M is not in the scene",
             "deviation from what was asked": asked,
@@ -256,7 +251,6 @@ def judge(
     )
     psm_a = figures.arms[0]
     with_m = trajectory.psm_m is not None
-    touching = figures.effort[~(playback.contact_n <= 0)]  # negated, so that NaN counts as contact
     return PlaybackReport(
         feasible=failure is None,
         failure=failure,
@@ -275,12 +269,8 @@ def judge(
         fk_error_deg=float(figures.fk_deg.max()),
         psm_m_fk_error_mm=float(figures.psm_m_fk_mm.max()) if with_m else None,
         shaft_off_mm=float(playback.shaft_off_mm.max()),
-        tracking_max_mm=float(playback.tracking_mm.max()),
-        tracking_rms_mm=float(np.sqrt(np.mean(playback.tracking_mm**2))),
-        goal_error_mm=float(playback.tracking_mm[trajectory.last_samples].max()),
-        peak_contact_n=float(playback.contact_n.max()),
-        peak_effort_ratio=float(figures.effort.max()),
-        peak_contact_effort_ratio=float(touching.max(initial=0.0)),
+        executed_off_mm=None if playback.tracking_mm is None else float(playback.tracking_mm.max()),
+        peak_contact_n=None if playback.contact_n is None else float(playback.contact_n.max()),
         deviation_mm=trajectory.deviation_mm,
         clearance_pad_mm=_least(playback, PAD),
         clearance_psm_m_mm=_least(playback, PSM_M) if with_m else None,
@@ -461,7 +451,6 @@ def _ends(
                 sample=end,
                 turn_deg=float(np.degrees(kinematics.angle_between(jaws[before][None], jaws[end][None])[0])),
                 alignment_error_deg=float(figures.fk_deg[end]),
-                goal_error_mm=float(playback.tracking_mm[end]),
                 n_to_a_m_deg=to_n,
                 a_to_a_m_deg=to_a,
             )

@@ -20,7 +20,7 @@ from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
 from tests.bench.million import million
 from tests.bench.neighbours import neighbours
-from tests.bench.playing import playing, verdicts
+from tests.bench.playing import playing, verdicts, windows
 from tests.bench.pose_styles import pose_styles
 from tests.bench.reading import reading
 from tests.bench.recognition import recognition
@@ -44,6 +44,7 @@ PARTS = {
     "motion": kinematics,
     "playback": playing,
     "verdict": verdicts,
+    "windows": windows,
     "doubt": doubting,
     "batches": batches,
     "scaling": scaling,

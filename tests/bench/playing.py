@@ -2,7 +2,9 @@
 
 import hashlib
 import time
-from itertools import pairwise
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -10,9 +12,8 @@ from rich.table import Table
 from skills.arrays import xyz
 from skills.dynamics import Servo, predict
 from skills.gridworld.scene import Scene, Tissue
-from skills.kinematics import instrument_of
 from skills.library.plans.plans import trajectory_of
-from skills.planning.handoff import HOLDING_RAD, PsmM
+from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import Trajectory, joint_ratios, time_parametrise
 from skills.simulation import player, simulator
@@ -39,7 +40,7 @@ def stacked(passes: int = PASSES, rate_hz: float = RATE_HZ) -> Trajectory:
 
 
 def playing(table: Table) -> None:
-    """Check twenty passes at 240 Hz with both arms: distances at every fourth sample, and the servo pass."""
+    """Check twenty passes at 240 Hz with both arms: distances at every fourth sample."""
     trajectory = stacked()
     asked = player.request(trajectory, player.default_pad_top(trajectory))
     ours, bare, quick = in_turn(
@@ -122,12 +123,9 @@ def two_at_once(trajectory: Trajectory, table: Table) -> None:
 def measure(asked: simulator.PlayRequest) -> None:
     """Do the work of a check in the simulator, except for the picture."""
     motion = asked.trajectory
-    with simulator.opened(motion.instrument, motion.rate_hz) as one:
+    with simulator.opened(motion.instrument) as one:
         one.set_up(motion, asked.pad_top_mm)
         simulator.kinematic_pass(one, asked)
-    with simulator.opened(motion.instrument, motion.rate_hz) as one:
-        one.place_pad(motion.tip_mm, asked.pad_top_mm)
-        simulator.servo_pass(one, motion)
 
 
 def plain(asked: simulator.PlayRequest, at_once: bool = False) -> None:
@@ -138,12 +136,9 @@ def plain(asked: simulator.PlayRequest, at_once: bool = False) -> None:
     motion = asked.trajectory
     assert motion.psm_m is not None
     arm_rows, m_rows = (simulator.in_metres(joints).tolist() for joints in (motion.joints, motion.psm_m.joints))
-    with simulator.opened(motion.instrument, motion.rate_hz) as one:
+    with simulator.opened(motion.instrument) as one:
         one.set_up(motion, asked.pad_top_mm)
         _plain_kinematic(one, arm_rows, m_rows, set(asked.looks.tolist()), at_once)
-    with simulator.opened(motion.instrument, motion.rate_hz) as one:
-        one.place_pad(motion.tip_mm, asked.pad_top_mm)
-        _plain_servo(one, arm_rows, motion)
 
 
 def _plain_kinematic(
@@ -174,23 +169,46 @@ def _plain_kinematic(
             bullet.getLinkState(arm.number, arm.shaft, 0, 1)
 
 
-def _plain_servo(one: simulator.Simulator, rows: list[list[float]], motion: Trajectory) -> None:
-    bullet, arm, pad = one.bullet, one.arm, one.pad
-    driven = [*arm.joints, *arm.fingers]
-    forces = [*instrument_of(motion.instrument).arm.effort, simulator.FINGER_EFFORT, simulator.FINGER_EFFORT]
-    fingers = [HOLDING_RAD] * 2
-    for row, following in pairwise(rows):
-        bullet.setJointMotorControlArray(
-            arm.number,
-            driven,
-            bullet.POSITION_CONTROL,
-            targetPositions=row + fingers,
-            targetVelocities=[(b - a) * motion.rate_hz for a, b in zip(row, following, strict=True)] + [0.0, 0.0],
-            forces=forces,
-            positionGains=[simulator.POSITION_GAIN] * 8,
-            velocityGains=[simulator.VELOCITY_GAIN] * 8,
+def windows(table: Table) -> None:
+    """Step through the windows of five passes by torques, and make the same calls alone; both in processor time."""
+    motion, servo = stacked(passes=5), Servo()
+    played, predicted = player.play(motion), predict(motion.joints, motion.stamps_s, servo, motion.instrument)
+    stretches = simulator.windows_of(motion, predicted, played.looked_at, played.clearances_mm)
+    seconds = float(np.diff(motion.stamps_s[stretches], axis=1).sum())
+    for with_m, named in ((False, "PSM_A and the pad"), (True, "with PSM_M")):
+        shown = motion if with_m else replace(motion, psm_m=None)
+        with simulator.opened(shown.instrument) as one:
+            one.set_up(shown, float(played.pad_mm[2]))
+            step_through = partial(simulator.torque_pass, one, shown, servo, predicted.executed, stretches)
+            step_through()  # compiled
+            calls: list[partial[Any]] = []
+            bullet = one.bullet
+            one.bullet = _Recorded(bullet, calls)
+            step_through()
+            one.bullet = bullet
+            ours, bare = in_turn(step_through, partial(_again, calls), rounds=ROUNDS)
+        said = f"{ours / seconds:.3f} s of processor per second of motion, goal 0.15"
+        table.add_row(f"{len(stretches)} windows by torques, {named}", f"{ours:.2f} s", said)
+        table.add_row(
+            "  the same calls of PyBullet alone", f"{bare:.2f} s", f"ours takes {ours / bare:.2f} of it, goal 1.3"
         )
-        bullet.stepSimulation()
-        bullet.getJointStates(arm.number, arm.joints)
-        bullet.getLinkState(arm.number, arm.tool, 0, 1)
-        bullet.getContactPoints(arm.number, pad)
+
+
+class _Recorded:
+    """PyBullet, with a list of all calls."""
+
+    def __init__(self, bullet: Any, calls: list[partial[Any]]) -> None:
+        self._bullet, self._calls = bullet, calls
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._bullet, name)
+        return partial(self._call, found) if callable(found) else found
+
+    def _call(self, function: Any, *given: Any, **named: Any) -> Any:
+        self._calls.append(partial(function, *given, **named))
+        return function(*given, **named)
+
+
+def _again(calls: list[partial[Any]]) -> None:
+    for call in calls:
+        call()

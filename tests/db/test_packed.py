@@ -94,7 +94,8 @@ PLAYBACK = Playback(
     joints=np.asfortranarray(np.arange(12.0).reshape(2, 6)),
     tracking_mm=np.zeros(2),
     efforts=np.full((2, 6), np.nan),
-    contact_n=np.zeros(2),
+    contact_n=None,
+    windows=None,
     looked_at=np.array([0, 1]),
     clearances_mm=np.zeros((2, 4)),
     shaft_off_mm=np.zeros(2),
@@ -103,7 +104,6 @@ PLAYBACK = Playback(
     picture_png=bytes(range(256)),
     engine="none \u00e9 \u2603",
     files={"psm.urdf": "0" * 64},
-    seconds_per_step=0.1 + 0.2,
 )
 SCENE = Scene(
     "base",

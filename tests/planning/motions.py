@@ -36,6 +36,7 @@ def ideal_playback(trajectory: Trajectory) -> Playback:
         tracking_mm=np.zeros(count),
         efforts=np.zeros((count, 6)),
         contact_n=np.zeros(count),
+        windows=np.zeros((0, 2), np.int64),
         looked_at=np.arange(count),
         clearances_mm=np.full((count, 4), 5.0),
         shaft_off_mm=np.zeros(count),
@@ -44,5 +45,4 @@ def ideal_playback(trajectory: Trajectory) -> Playback:
         picture_png=b"",
         engine="none",
         files={},
-        seconds_per_step=0.0,
     )

@@ -36,6 +36,7 @@ def _exact(asked: simulator.PlayRequest) -> Playback:
         tracking_mm=np.zeros(count),
         efforts=np.zeros((count, 6)),
         contact_n=np.zeros(count),
+        windows=np.zeros((0, 2), np.int64),
         looked_at=asked.looks,
         clearances_mm=np.full((looks, 4), 5.0),
         shaft_off_mm=np.zeros(looks),
@@ -44,7 +45,6 @@ def _exact(asked: simulator.PlayRequest) -> Playback:
         picture_png=b"\x89PNG\r\n\x1a\n",
         engine="none",
         files={"psm.urdf": "0" * 64},
-        seconds_per_step=1e-5,
     )
 
 
@@ -70,7 +70,6 @@ another_arm = _answering(psm_m_tip_mm=lambda _: np.zeros((1, 3)))
 no_picture = _answering(picture_png=b"GIF89a")
 no_bytes = _answering(picture_png="\x89PNG\r\n\x1a\n")
 no_name = _answering(engine="")
-no_duration = _answering(seconds_per_step="1e-5")
 
 
 def _writing(value: Any) -> Callable[[BinaryIO, BinaryIO], None]:

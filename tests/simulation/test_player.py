@@ -42,11 +42,8 @@ def test_a_small_plan_is_feasible(played):
     assert report.feasible, report.failure
     assert report.fk_error_mm < 1e-4
     assert report.fk_error_deg < 1e-3
-    assert report.tracking_max_mm < 1e-3
     assert report.shaft_off_mm < 1e-4
     assert report.clearance_pad_mm == pytest.approx(5.0, abs=0.1)  # the fingers are a little open, and round
-    assert report.peak_contact_n == 0.0
-    assert 0.0 < report.peak_effort_ratio < 0.5
     assert report.clearance_psm_m_mm is None
     assert report.engine == "PyBullet 3.2.7"
     assert played.picture_png.startswith(b"\x89PNG")
@@ -56,7 +53,7 @@ def test_a_small_plan_is_feasible(played):
 def test_the_same_trajectory_gives_identical_bytes_in_another_process(played):
     again = play(TRAJECTORY)
     assert judge(again, TRAJECTORY) == judge(played, TRAJECTORY)
-    assert digest(replace(again, seconds_per_step=0.0)) == digest(replace(played, seconds_per_step=0.0))
+    assert digest(again) == digest(played)
 
 
 @needs_simulator
@@ -238,7 +235,6 @@ def test_a_sound_answer_is_taken_whoever_gives_it():
         ("no_bytes", "nonsense"),
         ("no_name", "nonsense"),
         ("no_digest", "nonsense"),
-        ("no_duration", "nonsense"),
         ("incomplete", "nonsense"),
     ],
 )

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.needs("simulator")
 
 @pytest.fixture(scope="module")
 def opened():
-    with simulator.opened("400006", 240.0) as one:
+    with simulator.opened("400006") as one:
         yield one
 
 
@@ -32,7 +32,7 @@ def test_the_urdf_has_the_tip_where_the_closed_form_has_it(instrument):
     joints = joints_anywhere(1000, instrument)
     tip_mm, rotation = forward(joints, instrument)
     seen_mm, seen, read = np.empty((1000, 3)), np.empty((1000, 4)), np.empty((1000, 6))
-    with simulator.opened(instrument, 240.0) as one:
+    with simulator.opened(instrument) as one:
         for k in range(1000):
             one.pose(joints[k])
             seen_mm[k], seen[k] = one.read_tip()
@@ -114,7 +114,7 @@ CAPSULES = {  # ends, mm in the link's frame, and radius, as in psm.urdf
 
 def test_distances_to_the_pad_are_those_of_the_capsules_lowest_points():
     """Boxes of this size would be wrong by 0.7 mm: the simulator rounds their edges by its margin."""
-    with simulator.opened("400006", 240.0) as one:
+    with simulator.opened("400006") as one:
         one.place_pad(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), -190.0)
         rng = np.random.default_rng(5)
         for _ in range(100):
@@ -126,7 +126,7 @@ def test_distances_to_the_pad_are_those_of_the_capsules_lowest_points():
 
 
 def test_distances_between_arms_are_those_of_the_capsules_axes():
-    with simulator.opened("400006", 240.0) as one:
+    with simulator.opened("400006") as one:
         one.place_psm_m(np.array([50.0, 10.0, 0.0]), np.array([0.0, 0.17, 0.0, 0.985444]), instrument_of("400006"))
         assert one.psm_m is not None
         rng = np.random.default_rng(6)
@@ -165,7 +165,7 @@ def off_segment(point: np.ndarray, begin: np.ndarray, along: np.ndarray) -> floa
 
 
 def test_the_pad_is_as_large_as_the_needles_closed_form_takes_it():
-    with simulator.opened("400006", 240.0) as one:
+    with simulator.opened("400006") as one:
         for width, scale in ((10.0, 1.0), (200.0, 2.0)):
             one.place_pad(np.array([[0.0, 0.0, 0.0], [0.0, width, 0.0]]), -150.0)
             [shape] = one.bullet.getCollisionShapeData(one.pad, -1)
