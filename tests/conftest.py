@@ -136,10 +136,10 @@ def shared_simulator() -> Iterator[None]:
     from skills.simulation import player
 
     with closing(
-        ForkServer("skills.simulation.simulator", *(("pybullet",) if find_spec("pybullet") else ()))
+        ForkServer("skills.simulation.simulator:get_ready", *(("pybullet",) if find_spec("pybullet") else ()))
     ) as server:
 
-        def call(target: str, request: object, *, classes: Any, **how: Any) -> Any:
+        def call(target: str, request: object, *, classes: Any, ready: object = (), **how: Any) -> Any:
             with tempfile.TemporaryFile() as given:
                 packing.write(given, request, classes)
                 return server.call(target, given, classes=classes, **how)

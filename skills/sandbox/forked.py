@@ -30,7 +30,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from select import select
@@ -280,6 +280,7 @@ def call_alone(
     returns: tuple[type[Answer], ...],
     classes: Known,
     limits: ProcessLimits,
+    ready: Sequence[str] = (),
     watch: Watch | None = None,
 ) -> Answer:
     """Call a function in a new interpreter, and return its result.
@@ -290,12 +291,13 @@ def call_alone(
         returns: The classes of which the result may be.
         classes: The classes that may occur in the request and in the result, by name.
         limits: Limits of the process.
+        ready: Modules of its own, as for `ForkServer`: a contained process loads no machine code.
         watch: As for `ForkServer.call`.
 
     Raises:
         Unanswered, StorageFull, Busy: As for `ForkServer.call`.
     """
-    with tempfile.TemporaryFile() as given, closing(ForkServer()) as server:
+    with tempfile.TemporaryFile() as given, closing(ForkServer(*ready)) as server:
         packing.write(given, request, classes)
         return server.call(target, given, returns=returns, classes=classes, limits=limits, watch=watch)
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter
 
 from skills.dynamics import Servo
-from skills.fields import Count, Point, Sha256, schema
+from skills.fields import Count, Point, Sha256, exact, schema
 from skills.packing import canonical, sha256
 from skills.schemas import Given, PolicyName
 from skills.schemas.requests import LINE, DigestField, Schema, Size, Source, shown
@@ -61,6 +61,13 @@ def errors_of(stated: ErrorsIn) -> ArmErrors | None:
     return None if stated is None else NAMED[stated]
 
 
+@exact
+@schema
+@dataclass(frozen=True)
+class ServoIn(Servo):
+    """How a laboratory drives PSM_A, as a request states it; what is left out has its default (docs/execution.md)."""
+
+
 class PlaybackIn(Schema):
     """A playback: the plan to play in the simulator, and the errors of the arms to judge it under.
 
@@ -73,12 +80,17 @@ class PlaybackIn(Schema):
 
     plan: DigestField
     errors: ErrorsIn = None
-    servo: Servo | None = None
+    servo: ServoIn | None = None
 
     @property
     def arm_errors(self) -> ArmErrors | None:
         """The errors as a value of the domain."""
         return errors_of(self.errors)
+
+    @property
+    def driven(self) -> Servo | None:
+        """The servo as a value of the domain."""
+        return None if self.servo is None else Servo(**vars(self.servo))
 
 
 @schema

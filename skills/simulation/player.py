@@ -1,6 +1,7 @@
 """The player of trajectories in the simulator: metres and PyBullet in its process, millimetres and values in ours."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import TypeVar
 
@@ -21,6 +22,7 @@ from skills.verification.clearance import FINGER_REACH_MM, openings, psm_m_poses
 from skills.verification.playback import Playback
 
 SIMULATOR = "skills.simulation.simulator:simulate"
+LOOPS_READY = "skills.simulation.simulator:get_ready"
 PAD_BELOW_MM = 5.0  # ours: height of the finger tips above a pad whose height is not given
 CLEARANCE_EVERY = 4  # samples: 0.33 mm of the tip's path at 20 mm/s and 240 Hz, for which the bounds on distances allow
 Answer = TypeVar("Answer")
@@ -78,7 +80,8 @@ def play(
     if target == SIMULATOR:
         simulator.require_pybullet()
     limits = ProcessLimits(memory_bytes, timeout_s)
-    playback = simulated(target, request(trajectory, pad, clearance_every, servo), Playback, CLASSES, limits)
+    asked, ready = request(trajectory, pad, clearance_every, servo), () if servo is None else (LOOPS_READY,)
+    playback = simulated(target, asked, Playback, CLASSES, limits, ready)
     try:
         mine = replace(playback, trajectory=trajectory)  # checks all shapes again
     except BadInput as error:
@@ -133,7 +136,12 @@ def looks(trajectory: Trajectory, every: int) -> Ints:
 
 
 def simulated(
-    target: str, request: object, returns: type[Answer], classes: packing.Known, limits: ProcessLimits
+    target: str,
+    request: object,
+    returns: type[Answer],
+    classes: packing.Known,
+    limits: ProcessLimits,
+    ready: Sequence[str] = (),
 ) -> Answer:
     """Send a request to a simulator in a new process and return its answer.
 
@@ -145,13 +153,14 @@ def simulated(
         returns: The class of its answer.
         classes: The classes that may occur in the request and in the answer, by name.
         limits: Limits of its process.
+        ready: Modules of it, as for `call_alone`.
 
     Raises:
         SimulationFailed: It hung, crashed, ran out of memory, failed, or returned too much or anything else;
             `numbers["cause"]` has the cause, and the end of its output is a note of the error.
     """
     try:
-        return call_alone(target, request, returns=(returns,), classes=classes, limits=limits)
+        return call_alone(target, request, returns=(returns,), classes=classes, limits=limits, ready=ready)
     except Unanswered as error:
         raise error.translated(SimulationFailed, "The simulator", _ADVICE) from error.__cause__
 

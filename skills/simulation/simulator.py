@@ -36,9 +36,19 @@ from numpy.typing import NDArray
 
 from skills import packing
 from skills.arrays import Flags, Floats, Ints
+from skills.compiled import cache_folders, check_cache_folder, make_ready
 from skills.dynamics import Drive, Executed, Prediction, Servo, drive_of, predict, torques
 from skills.errors import SimulationFailed
-from skills.kinematics import INSERTION, JOINTS, InstrumentConstants, axes_of, forward, instrument_of, matrix_of
+from skills.kinematics import (
+    DEFAULT_INSTRUMENT,
+    INSERTION,
+    JOINTS,
+    InstrumentConstants,
+    axes_of,
+    forward,
+    instrument_of,
+    matrix_of,
+)
 from skills.planning.handoff import HELD_MM, HOLDING_RAD, OPEN_RAD, OtherArm
 from skills.planning.motion_laws import A1, A2, Poses
 from skills.planning.trajectory import PSM_A, PSM_M, Trajectory
@@ -547,6 +557,21 @@ def _executed(asked: PlayRequest, servo: Servo, played: Playback) -> Playback:
         joints, efforts, contact_n = torque_pass(scene, motion, servo, predicted.executed, windows)
     tracking_mm = np.linalg.norm(forward(joints, motion.instrument)[0] - motion.tip_mm, axis=1)
     return replace(played, tracking_mm=tracking_mm, efforts=efforts, contact_n=contact_n, windows=windows)
+
+
+def get_ready() -> None:
+    """Load the loops of executed motions: a contained process would compile them anew, which takes two seconds."""
+    for folder in cache_folders():
+        check_cache_folder(folder)
+    make_ready(_shortest)
+
+
+def _shortest() -> None:
+    """Execute the shortest motion, and make one step of it."""
+    joints, stamps_s, servo = np.tile([0.0, 0.0, 100.0, 0.0, 0.0, 0.0], (2, 1)), np.array([0.0, 0.01]), Servo()
+    predict(joints, stamps_s, servo, ranged=False)
+    drive = drive_of(joints, stamps_s, servo, servo.arm(0.5, 0.5), DEFAULT_INSTRUMENT)
+    torques(1, 0.0, servo.step_s, np.eye(6), np.zeros((2, 6)), np.zeros((4, 6)), *drive)
 
 
 def torque_pass(

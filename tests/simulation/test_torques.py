@@ -9,7 +9,8 @@ import pytest
 from skills.dynamics import Servo, execute
 from skills.kinematics import forward, instrument_of, quaternion_of
 from skills.planning.trajectory import A1, Trajectory
-from skills.simulation import simulator
+from skills.sandbox.forked import call_alone
+from skills.simulation import player, simulator
 from skills.simulation.player import play
 from skills.simulation.simulator import torque_pass
 from skills.verification.clearance import FINGER_RADIUS_MM, links_of
@@ -163,3 +164,14 @@ def test_without_a_servo_nothing_is_executed():
     assert (found.tracking_mm, found.efforts, found.contact_n, found.windows) == (None,) * 4
     report = judge(found, motion)
     assert report.feasible and (report.executed_off_mm, report.peak_contact_n) == (None, None)
+
+
+def test_a_process_of_its_own_has_the_loops_and_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests' simulators are forks of one server; a command starts a new interpreter."""
+    motion, servo = small_trajectory(), Servo()
+    shared = player.play(motion, servo=servo)
+    monkeypatch.setattr(player, "call_alone", call_alone)
+    alone = player.play(motion, servo=servo)
+    for name in ("tracking_mm", "efforts", "contact_n", "joints"):
+        assert np.array_equal(getattr(alone, name), getattr(shared, name)), name
+    assert shared.tracking_mm is not None and shared.tracking_mm.max() > 0.1

@@ -28,7 +28,7 @@ def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configure
         surgeon = plans.find_plan(session, body.plan).policy.surgeon.slug
 
     def request(session: Session) -> RequestedJob:
-        return playbacks.request_playback(session, body.plan, actor, settings, body.arm_errors, body.servo)
+        return playbacks.request_playback(session, body.plan, actor, settings, body.arm_errors, body.driven)
 
     return start_job(db, jobs, [locks.surgeon(surgeon)], request)
 
