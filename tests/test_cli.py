@@ -172,9 +172,15 @@ def test_a_plan_is_played_drawn_exported_and_its_bag_verified(
     code, said = skills("play", plan, "--errors", str(own))
     assert (code, "JSON with name, registration_mm" in said, "calibrate-arm" in said) == (1, True, True), said
     own.write_text(json.dumps(asdict(ARMS)))
+    driven = tmp_path / "servo.json"
+    driven.write_text('{"velocitys": false}')
+    code, said = skills("play", plan, "--servo", str(driven))
+    assert (code, "velocitys" in said, "docs/execution.md" in said) == (1, True, True), said
+    driven.write_text('{"gravity_compensated": true}')
     pictures = ("--pictures", str(tmp_path / "pictures")) if drawn else ()
-    code, said = skills("play", plan, "--errors", str(own), *pictures)
+    code, said = skills("play", plan, "--errors", str(own), "--servo", str(driven), *pictures)
     assert (code, "feasible" in said, "bench: registration 0.3 mm" in said) == (0, True, True), said
+    assert "The tip is predicted" in said and "Not validated on hardware" in said
     kinds = {"playback.png": b"\x89PNG", "joints.png": b"\x89PNG", "clearance.png": b"\x89PNG", "playback.gif": b"GIF8"}
     for name, begins in kinds.items() if drawn else ():
         assert (tmp_path / "pictures" / name).read_bytes().startswith(begins)
