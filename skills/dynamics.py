@@ -16,6 +16,7 @@ arm in motion: loads, inertias and frictions are a linear fit of ours to one pub
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from math import isfinite, radians
 from typing import Any, NamedTuple
@@ -140,18 +141,34 @@ class Executed:
     Attributes:
         joints: The links' joints, behind the play.
         efforts: The motors' efforts.
-        droop: The part of the joints' error by their load.
-        lag: The part by speed, delay, inertia and a limit of effort.
-        stick: The part by dry friction and play.
         motors: Places and speeds of the motors, rad and m, shape (T, 2, 6).
+        friction: The dry friction that they feel.
+        planned: The planned joints.
+        arm: The arm, as by `Servo.arm`.
     """
 
     joints: Floats
     efforts: Floats
-    droop: Floats
-    lag: Floats
-    stick: Floats
     motors: Floats
+    friction: Floats
+    planned: Floats
+    arm: Floats
+
+    @cached_property
+    def droop(self) -> Floats:
+        """The part of the joints' error by their load."""
+        share = self.arm[6] - self.arm[7]
+        return np.asarray(-share * loads(self.motors[:, 0] / _UNITS) / self.arm[0] / _UNITS)
+
+    @cached_property
+    def stick(self) -> Floats:
+        """The part by dry friction and play."""
+        return np.asarray(self.joints - (self.motors[:, 0] + self.friction / self.arm[0]) / _UNITS)
+
+    @property
+    def lag(self) -> Floats:
+        """The part by speed, delay, inertia and a limit of effort."""
+        return self.joints - self.planned - self.droop - self.stick
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +215,9 @@ def predict(
         raise BadInput("A motion to be executed needs a sample, and stamps that increase.")
     # Loads and frictions can add up or cancel.
     ends = [servo.arm(*parts) for parts in product((0.0, 1.0), repeat=2)] if ranged else []
-    arms = [execute(planned, stamps, servo, arm, instrument) for arm in (servo.arm(0.5, 0.5), *ends)]
+    middle = servo.arm(0.5, 0.5)
+    drive = drive_of(planned, stamps, servo, middle, instrument)
+    arms = [_executed(drive, planned, arm) for arm in (middle, *ends)]
     tip_mm, rotation = forward(planned, instrument)
     off = []
     for arm in arms:
@@ -277,7 +296,12 @@ def execute(joints: Floats, stamps_s: Floats, servo: Servo, arm: Floats, instrum
         arm: The arm, as by `Servo.arm`.
         instrument: Number of the instrument, whose greatest efforts count.
     """
-    drive = drive_of(joints, stamps_s, servo, arm, instrument)
+    return _executed(drive_of(joints, stamps_s, servo, arm, instrument), joints, arm)
+
+
+def _executed(drive: Drive, joints: Floats, arm: Floats) -> Executed:
+    """Return the motion of an arm, (8, 6), along a plan, which is given as `joints` too, rad and mm."""
+    drive = drive._replace(parts=np.concatenate([arm, drive.parts[8:]]), known=np.zeros(1, np.int64))
     plan, share, stiffness = drive.plan, arm[6] - arm[7], arm[0]
     motor, (link, effort, friction) = np.zeros((len(plan), 2, 6)), np.zeros((3, *plan.shape))
     rest = plan[:1].copy()
@@ -285,10 +309,7 @@ def execute(joints: Floats, stamps_s: Floats, servo: Servo, arm: Floats, instrum
         rest = plan[:1] - share * loads(rest / _UNITS) / stiffness
     motor[0, 0], link[0], effort[0] = rest[0], rest[0], arm[6] * loads(rest / _UNITS)[0]
     _run(drive, motor[0].copy(), np.zeros((3, 6)), motor, link, effort, friction)
-    droop = -share * loads(motor[:, 0] / _UNITS) / stiffness
-    stick = (link - motor[:, 0]) - friction / stiffness
-    lag = link - plan - droop - stick
-    return Executed(link / _UNITS, effort, droop / _UNITS, lag / _UNITS, stick / _UNITS, motor)
+    return Executed(link / _UNITS, effort, motor, friction, joints, arm)
 
 
 @inner
