@@ -4,7 +4,9 @@ import subprocess
 import sys
 
 import pytest
+from typer.testing import CliRunner
 
+from skills.cli import app
 from skills.errors import BadInput, BadSettings
 from skills.formats import bag_writer as say
 from skills.formats.topics import BOOL
@@ -235,3 +237,10 @@ def test_a_domain_and_an_interface_cannot_be_anything(domain_id, interface):
 
     with pytest.raises(BadSettings):
         DdsBus(domain_id, interface)
+
+
+def test_without_the_extra_the_commands_say_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    for command in (["arm", "check", "PSM1"], ["arm", "simulate", "PSM1", "--seconds", "1"]):
+        ran = CliRunner().invoke(app, command)
+        assert ran.exit_code == 1 and "pip install 'suture-skills[live]'" in ran.output
