@@ -11,8 +11,9 @@ link follows its motor with a play. So the error of a joint is the sum of its *d
 *stick* -f / P and the play, and its *lag*, the rest: inertia, viscous friction, setpoints that are old or without a
 speed, an effort at its limit.
 
-Lengths are metres inside of this module, so that gains have their published units. Nothing of it was validated on an
-arm in motion: loads, inertias and frictions are a linear fit of ours to one published data set.
+Lengths are metres inside of this module, so that gains have their published units. The default loads, inertias and
+frictions are a linear fit of ours to one published data set. In a published recording of another arm in motion they
+tell little more than no prediction does, where a servo that is fitted to that arm tells much (docs/execution.md).
 """
 
 from dataclasses import dataclass, replace
@@ -32,7 +33,7 @@ from skills.fields import Six, exact, schema
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, WRIST_MM, axes_of, forward, instrument_of
 
 NOT_VALIDATED = (
-    "Not validated on hardware: gains are published, loads are fitted to one arm, wrist and play are ranges."
+    "Not validated on hardware: what is not stated of gains, loads and frictions is published, of other arms."
 )
 _UNITS = np.array([1.0, 1.0, 1e-3, 1.0, 1.0, 1.0])  # rad and m of rad and mm
 # Loads of yaw, pitch and insertion (Nm, Nm, N) as factors of 1, sin q1, cos q1, sin q2 cos q1, cos q2 cos q1,

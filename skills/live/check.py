@@ -138,14 +138,15 @@ def listen_to(bus: Bus, arm: str, seconds: float = 3.0, *, poll_s: float = 0.002
     while time.monotonic() < ends:
         now_ns = time.time_ns()
         for name, take in takes.items():
-            said[name] += [(one.received_s, now_ns, _value(topics[name], one.data)) for one in take()]
+            said[name] += [(one.received_s, now_ns, value_from(topics[name], one.data)) for one in take()]
         for one in teleoperation():
-            teleoperated = _value(TELEOPERATION, one.data) is True
+            teleoperated = value_from(TELEOPERATION, one.data) is True
         time.sleep(poll_s)
     return Heard(arm, seconds, said, teleoperated, bus.writers())
 
 
-def _value(topic: BusTopic, data: bytes) -> Value | None:
+def value_from(topic: BusTopic, data: bytes) -> Value | None:
+    """Return a message as a value, or None if its bytes are none of the topic's type."""
     try:
         return decode(topic.type, data)
     except BadInput:

@@ -3,7 +3,7 @@
 from collections import defaultdict
 
 from skills.live.bus import Seen, Writer
-from skills.live.check import Heard, _value
+from skills.live.check import Heard, value_from
 from skills.live.interface import TELEOPERATION, BusTopic, measured
 from skills.live.stand_in import StandIn
 
@@ -54,10 +54,10 @@ def heard_of(bus: MemoryBus, arm: str, seconds: float) -> Heard:
     """Return what was heard, as `listen_to` does."""
     said = {
         name: [
-            (one.received_s, BEGAN_NS + round(1e9 * one.received_s), _value(topic, one.data))
+            (one.received_s, BEGAN_NS + round(1e9 * one.received_s), value_from(topic, one.data))
             for one in bus.said[topic.name]
         ]
         for name, topic in measured(arm).items()
     }
-    told = [_value(TELEOPERATION, one.data) for one in bus.said[TELEOPERATION.name]]
+    told = [value_from(TELEOPERATION, one.data) for one in bus.said[TELEOPERATION.name]]
     return Heard(arm, seconds, said, told[-1] if told else None, bus.writers())
